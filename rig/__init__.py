@@ -1,0 +1,1 @@
+"""The bench, sweeps, runs on disk and the `rig` command."""

@@ -1,0 +1,302 @@
+"""`rig.toml`: what the bench is made of, checked before anything is opened."""
+
+import hashlib
+import importlib.resources
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rig.errors import ConfigError
+from rig.interlock import Interlock, KeepOut
+from rig.kinematics import AxisMap
+
+SIMULATED_PORT = "sim:"
+"""A port that starts so is an instrument of the simulated bench, by name."""
+
+ANGLES = {"source": "theta_i", "detector": "theta_r"}
+"""The axes of the bench and the angles they realise."""
+
+
+@dataclass(frozen=True)
+class AxisConfig:
+    """One axis: which stage, where it hangs, how its angle counts, where it may go (degrees, seconds)."""
+
+    name: str
+    model: str
+    port: str
+    map: AxisMap
+    limits_deg: tuple[float, float]
+    speed_deg_s: float | None
+    acceleration_deg_s2: float | None
+    settle_s: float
+    tolerance_deg: float
+    options: Mapping[str, Any]
+    serial: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """The light sensor: which one, where it hangs, how long it looks (seconds)."""
+
+    model: str
+    port: str
+    integration_s: float
+    options: Mapping[str, Any]
+    serial: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """How the simulated bench runs: times faster than time, and its seed (None: a fresh one each time)."""
+
+    speed: float
+    seed: int | None
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """All of `rig.toml`."""
+
+    name: str
+    axes: Mapping[str, AxisConfig]
+    sensor: SensorConfig
+    keep_out: KeepOut
+    simulation: Simulation | None
+    text: str = field(repr=False)
+    source: str
+
+    @property
+    def simulated(self) -> bool:
+        """True where the instruments are simulated."""
+        return self.simulation is not None
+
+    @property
+    def interlock(self) -> Interlock:
+        """Limits and keep-out."""
+        return Interlock({name: axis.limits_deg for name, axis in self.axes.items()}, self.keep_out)
+
+    @property
+    def sha256(self) -> str:
+        """Identity of the configuration."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def template() -> str:
+    """Return the commented `rig.toml` that `rig init` writes."""
+    return importlib.resources.files("rig").joinpath("data/rig.toml").read_text(encoding="utf-8")
+
+
+def load_config(option: str | None) -> BenchConfig:
+    """Return the configuration of `--config`, else of `./rig.toml`, else of the simulated bench.
+
+    Raises
+    ------
+    ConfigError
+        One line that names the file, the key and what it may be.
+    """
+    path = Path(option) if option else Path("rig.toml")
+    if option is None and not path.exists():
+        text = importlib.resources.files("rig").joinpath("data/simulated.toml").read_text(encoding="utf-8")
+        return parse_config(text, "simulated.toml")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as exc:
+        raise ConfigError(f"{path}: cannot be read: {exc}; `rig init` writes one to start from") from exc
+    return parse_config(text, str(path))
+
+
+def parse_config(text: str, source: str) -> BenchConfig:
+    """Return the configuration that `text` (TOML) gives; `source` names it in messages.
+
+    Raises
+    ------
+    ConfigError
+        One line that names the source, the key and what it may be.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        raise ConfigError(f"{source}: not TOML: {exc}") from exc
+    top = _Table(document, source, "")
+    bench = top.table("bench", required=False)
+    name = bench.text("name", default="bench")
+    bench.done()
+    simulation = _simulation(top.table("simulation")) if "simulation" in document else None
+    axes = top.table("axes")
+    axis_configs = {axis: _axis(axis, axes.table(axis)) for axis in ANGLES}
+    axes.done()
+    config = BenchConfig(
+        name=name,
+        axes=axis_configs,
+        sensor=_sensor(top.table("sensor")),
+        keep_out=_keep_out(top.table("keep_out")),
+        simulation=simulation,
+        text=text,
+        source=source,
+    )
+    top.done()
+    _check_ports(config)
+    return config
+
+
+def _axis(name: str, table: "_Table") -> AxisConfig:
+    model, options, serial = _device(table, "rotary-axis")
+    low, high = table.pair("limits")
+    if low >= high:
+        raise table.error("limits", f"[{low:g}, {high:g}] are swapped: give [lowest, highest] in degrees")
+    sign = table.number("sign", default=1)
+    if sign not in (1, -1):
+        raise table.error("sign", f"{sign:g} may be 1 or -1")
+    config = AxisConfig(
+        name=name,
+        model=model,
+        port=table.text("port"),
+        map=AxisMap(int(sign), table.number("offset", default=0.0)),
+        limits_deg=(low, high),
+        speed_deg_s=table.positive("speed", default=None),
+        acceleration_deg_s2=table.positive("acceleration", default=None),
+        settle_s=table.number("settle", default=0.1, low=0.0),
+        tolerance_deg=table.positive("tolerance", default=0.02) or 0.02,
+        options=options,
+        serial=serial,
+    )
+    table.done()
+    return config
+
+
+def _sensor(table: "_Table") -> SensorConfig:
+    model, options, serial = _device(table, "light-sensor")
+    integration = table.positive("integration", default=0.1)
+    assert integration is not None
+    config = SensorConfig(model, table.text("port"), integration, options, serial)
+    table.done()
+    return config
+
+
+def _keep_out(table: "_Table") -> KeepOut:
+    zone = KeepOut(table.number("within", low=0.0, high=90.0), table.flag("crossing"))
+    table.done()
+    return zone
+
+
+def _simulation(table: "_Table") -> Simulation:
+    speed = table.positive("speed", default=1.0)
+    assert speed is not None
+    seed = table.number("seed", default=None, low=0)
+    table.done()
+    return Simulation(speed, None if seed is None else int(seed))
+
+
+def _device(table: "_Table", kind: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return model, the model's own options and the serial settings that `table` gives."""
+    from drivers import catalogue
+
+    known = {name: model for name, model in catalogue.models().items() if model.kind == kind}
+    name = table.text("model")
+    if name not in known:
+        raise table.error("model", f"unknown model {name!r}; a {kind} may be {', '.join(sorted(known))}")
+    model = known[name]
+    options = {key: table.option(key, option.type) for key, option in model.options.items() if key in table}
+    serial = {key: table.option(key, type(default)) for key, default in model.serial.items() if key in table}
+    return name, options, serial
+
+
+def _check_ports(config: BenchConfig) -> None:
+    for key, port in [(f"axes.{a.name}.port", a.port) for a in config.axes.values()] + [("sensor.port", config.sensor.port)]:
+        if port.startswith(SIMULATED_PORT) is not config.simulated:
+            what = (
+                f"{SIMULATED_PORT}NAME, since [simulation] is there"
+                if config.simulated
+                else "a port; [simulation] is missing for sim: ports"
+            )
+            raise ConfigError(f"{config.source}: {key}: {port!r} must be {what}")
+    source, detector = config.axes.values()
+    if source.port == detector.port and source.options == detector.options:
+        raise ConfigError(f"{config.source}: axes.detector.address: the same stage as axes.source; give each its own address or port")
+
+
+class _Table:
+    """A TOML table that knows where it stands and which of its keys were asked for."""
+
+    def __init__(self, values: Mapping[str, Any], source: str, path: str) -> None:
+        self._values = values
+        self._source = source
+        self._path = path
+        self._asked: set[str] = set()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def error(self, key: str, what: str) -> ConfigError:
+        return ConfigError(f"{self._source}: {self._path}{key}: {what}")
+
+    def table(self, key: str, *, required: bool = True) -> "_Table":
+        self._asked.add(key)
+        value = self._values.get(key, None if required else {})
+        if not isinstance(value, dict):
+            raise self.error(key, "missing: expected a table" if value is None else f"expected a table [{self._path}{key}]")
+        return _Table(value, self._source, f"{self._path}{key}.")
+
+    def _get(self, key: str, default: Any, expected: str) -> Any:
+        self._asked.add(key)
+        if key in self._values:
+            return self._values[key]
+        if default is _REQUIRED:
+            raise self.error(key, f"missing: expected {expected}")
+        return default
+
+    def text(self, key: str, *, default: Any = None) -> str:
+        value = self._get(key, _REQUIRED if default is None else default, "text in quotes")
+        if not isinstance(value, str) or not value:
+            raise self.error(key, f"{value!r} must be text in quotes")
+        return value
+
+    def number(self, key: str, *, default: Any = ..., low: float = -float("inf"), high: float = float("inf")) -> Any:
+        value = self._get(key, _REQUIRED if default is ... else default, "a number")
+        if value is None and key not in self._values:
+            return None
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not low <= value <= high
+            or value in (float("inf"), -float("inf"))
+        ):
+            bounds = f" from {low:g} to {high:g}" if high < float("inf") else f" not below {low:g}" if low > -float("inf") else ""
+            raise self.error(key, f"{value!r} must be a number{bounds}")
+        return value
+
+    def positive(self, key: str, *, default: float | None) -> float | None:
+        value = self.number(key, default=default)
+        if value is not None and value <= 0:
+            raise self.error(key, f"{value!r} must be a number above 0")
+        return None if value is None else float(value)
+
+    def flag(self, key: str) -> bool:
+        value = self._get(key, _REQUIRED, "true or false")
+        if not isinstance(value, bool):
+            raise self.error(key, f"{value!r} may be true or false")
+        return value
+
+    def pair(self, key: str) -> tuple[float, float]:
+        value = self._get(key, _REQUIRED, "[lowest, highest]")
+        if not isinstance(value, list) or len(value) != 2 or not all(type(v) in (int, float) and abs(v) <= 360 for v in value):
+            raise self.error(key, f"{value!r} must be [lowest, highest] in degrees")
+        return float(value[0]), float(value[1])
+
+    def option(self, key: str, kind: type) -> Any:
+        value = self._get(key, _REQUIRED, kind.__name__)
+        good = isinstance(value, int | float) and not isinstance(value, bool) if kind is float else type(value) is kind
+        if not good:
+            raise self.error(key, f"{value!r} must be {_KIND_NAMES.get(kind, kind.__name__)}")
+        return kind(value)
+
+    def done(self) -> None:
+        unknown = sorted(set(self._values) - self._asked)
+        if unknown:
+            raise self.error(unknown[0], f"unknown key; here may stand {', '.join(sorted(self._asked))}")
+
+
+_REQUIRED = object()
+_KIND_NAMES = {int: "a whole number", float: "a number", str: "text in quotes", bool: "true or false"}

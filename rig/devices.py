@@ -1,0 +1,353 @@
+"""Our instruments as bluesky sees them: structural types only, bluesky itself is not imported.
+
+What each owes the engine: https://blueskyproject.io/bluesky/main/hardware.html
+"""
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from drivers.errors import DeviceError, MoveTimeout
+from drivers.kinds import LightReading, LightSensor, RotaryAxis
+from rig.bus import BusWorker, Task
+from rig.clock import Clock
+from rig.errors import InterlockError
+from rig.kinematics import AxisMap
+from rig.status import Status
+
+POLL_S = 0.004
+"""How often an axis that should have arrived is asked again."""
+
+Reading = dict[str, dict[str, Any]]
+
+
+def _reading(**values: Any) -> Reading:
+    now = time.time()
+    return {key: {"value": value, "timestamp": now} for key, value in values.items()}
+
+
+class Axis:
+    """A positioner in degrees of theta: Movable, Locatable, Stoppable, Readable and Checkable.
+
+    Parameters
+    ----------
+    name : str
+        The axis, e.g. `detector`.
+    angle : str
+        The angle it realises, e.g. `theta_r`; its readback carries this name in every event.
+    driver : RotaryAxis
+    axis_map : AxisMap
+    bus : BusWorker
+        The worker of the port the stage hangs on.
+    clock : Clock
+    settle_s : float
+        How long the arm rings after the stage has arrived.
+    tolerance_deg : float
+        How far from its target a stage that has arrived may stand.
+    check : callable
+        `check(axis name, theta_deg)` raises InterlockError where the axis may not go.
+    """
+
+    parent = None
+
+    def __init__(
+        self,
+        name: str,
+        angle: str,
+        driver: RotaryAxis,
+        axis_map: AxisMap,
+        bus: BusWorker,
+        clock: Clock,
+        *,
+        settle_s: float,
+        tolerance_deg: float,
+        check: Callable[[str, float], None],
+    ) -> None:
+        self.name = name
+        self.angle = angle
+        self.driver = driver
+        self.map = axis_map
+        self.settle_s = settle_s
+        self.tolerance_deg = tolerance_deg
+        self.homing = Homing(self)
+        self._bus = bus
+        self._clock = clock
+        self._check = check
+        self._profile = driver.profile()
+        self._identity = driver.identify()
+        self._moving: Status | None = None
+        self._stopped = False
+        self._setpoint = math.nan
+        self._readback = math.nan
+        self._homed = False
+        self.refresh()
+
+    # -- what it knows -------------------------------------------------------------------------------------------------
+
+    @property
+    def homed(self) -> bool:
+        """True where the stage knows its position."""
+        return self._homed
+
+    @property
+    def position(self) -> float:
+        """The last readback in degrees of theta."""
+        return self._readback
+
+    @property
+    def destination(self) -> float:
+        """Where the axis is going, or else stands, in degrees of theta."""
+        return self._setpoint if self._moving is not None and not self._moving.done else self._readback
+
+    def refresh(self) -> None:
+        """Ask the stage where it stands."""
+        state = self.driver.state()
+        self._homed = state.homed
+        self._readback = self.map.to_theta(state.position_deg)
+
+    def travel_s(self, from_deg: float, to_deg: float) -> float:
+        """Return the bench seconds a move takes, settling included."""
+        distance = abs(to_deg - from_deg)
+        return self._profile.duration_s(distance) + self.settle_s if distance else 0.0
+
+    # -- bluesky -------------------------------------------------------------------------------------------------------
+
+    @property
+    def hints(self) -> dict[str, Any]:
+        """The field worth plotting."""
+        return {"fields": [self.angle]}
+
+    def check_value(self, value: float) -> None:
+        """Raise InterlockError where the axis may not go to `value` (degrees)."""
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InterlockError(f"axis {self.name}: expected an angle in degrees, got {value!r}; nothing was moved")
+        self._check(self.name, float(value))
+
+    def set(self, value: float) -> Status:
+        """Go to `value` degrees; the status ends when the arm stands still there.
+
+        Raises
+        ------
+        InterlockError
+            Where the axis may not go there; nothing was moved.
+        """
+        target = float(value)
+        self.check_value(target)
+        return self._begin(self._move(target), target)
+
+    def home(self) -> Status:
+        """Find the stage's reference; the status ends when it stands there."""
+        return self._begin(self._home(), math.nan)
+
+    def stop(self, success: bool = True) -> None:
+        """Stop at once, from any thread.
+
+        A move of ours that is under way counts as ended well (the engine then repeats it when resumed);
+        a stop that nobody asked for fails the move.
+        """
+        self._stopped = True
+        self.driver.stop()
+
+    def locate(self) -> dict[str, float]:
+        """Return setpoint and readback in degrees."""
+        return {"setpoint": self._setpoint, "readback": self._readback}
+
+    def read(self) -> Reading:
+        """Return setpoint and readback as they were when the last move ended."""
+        return _reading(**{self.angle: self._readback, f"{self.angle}_setpoint": self._setpoint})
+
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Return type, unit and source of what `read` gives."""
+        key = {"source": f"axis:{self.name}", "dtype": "number", "shape": [], "units": "degree"}
+        return {self.angle: dict(key), f"{self.angle}_setpoint": dict(key)}
+
+    def read_configuration(self) -> Reading:
+        """Return the stage's identity and how its angle is counted."""
+        return _reading(**{f"{self.name}_{key}": value for key, value in self._configuration().items()})
+
+    def describe_configuration(self) -> dict[str, dict[str, Any]]:
+        """Return type and source of what `read_configuration` gives."""
+        return _describe_values(f"axis:{self.name}", self.name, self._configuration())
+
+    def _configuration(self) -> dict[str, Any]:
+        return {
+            "vendor": self._identity.vendor,
+            "model": self._identity.model,
+            "serial_number": self._identity.serial_number,
+            "firmware": self._identity.firmware,
+            "sign": self.map.sign,
+            "offset_deg": self.map.offset_deg,
+            "speed_deg_s": self._profile.speed_deg_s,
+            "acceleration_deg_s2": self._profile.acceleration_deg_s2,
+            "settle_s": self.settle_s,
+            "tolerance_deg": self.tolerance_deg,
+        }
+
+    # -- motion --------------------------------------------------------------------------------------------------------
+
+    def _begin(self, task: Task, target: float) -> Status:
+        self._stopped = False
+        self._setpoint = target
+        self._moving = self._bus.start(task)
+        return self._moving
+
+    def _move(self, target: float) -> Task:
+        axis_deg = self.map.to_axis(target)
+        state = self.driver.state()
+        self._readback = self.map.to_theta(state.position_deg)
+        if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance_deg:
+            return
+        duration = self._profile.duration_s(abs(self._readback - target))
+        if self._stopped:
+            return
+        self.driver.start_move(axis_deg)
+        if self._stopped:  # the stop came while the command was on its way
+            self.driver.stop()
+        yield from self._until_idle(f"the move to {target:g} deg", duration)
+        if not self._stopped:
+            self.driver.check_arrival(axis_deg, self.tolerance_deg)
+            yield self.settle_s
+        self.refresh()
+
+    def _home(self) -> Task:
+        if self._stopped:
+            return
+        self.driver.start_home()
+        if self._stopped:
+            self.driver.stop()
+        yield from self._until_idle("homing", self._profile.duration_s(360.0), predicted=False)
+        if not self._stopped:
+            yield self.settle_s
+        self.refresh()
+        if not self._stopped and not self._homed:
+            raise DeviceError(
+                f"axis {self.name}: homing ended but the stage still has no reference; look at its warnings and home it again"
+            )
+
+    def _until_idle(self, what: str, duration: float, *, predicted: bool = True) -> Task:
+        started = self._clock.monotonic()
+        if predicted:
+            yield from self._watch(duration)
+        while self.driver.state().moving:
+            elapsed = self._clock.monotonic() - started
+            if elapsed > 3 * duration + 5.0:
+                self.driver.stop()
+                raise MoveTimeout(f"axis {self.name}: {what} took {elapsed:.1f} s, expected {duration:.1f} s; the axis was stopped")
+            yield POLL_S * self._clock.speed
+
+    def _watch(self, duration: float) -> Task:
+        """Wait out a predicted travel, yet notice within 50 ms that the axis was told to stop."""
+        end = self._clock.monotonic() + duration
+        while not self._stopped and (left := end - self._clock.monotonic()) > 0:
+            yield min(left, 0.05 * self._clock.speed)
+
+
+class Homing:
+    """The homing of an axis as something a plan can `set`, so that pausing and resuming hold for it too."""
+
+    parent = None
+
+    def __init__(self, axis: Axis) -> None:
+        self.name = f"{axis.name}_homing"
+        self._axis = axis
+
+    def set(self, value: Any) -> Status:
+        """Home the axis."""
+        return self._axis.home()
+
+    def stop(self, success: bool = True) -> None:
+        """Stop the axis."""
+        self._axis.stop(success)
+
+    def read(self) -> Reading:
+        """Return whether the axis has its reference."""
+        return _reading(**{self.name: int(self._axis.homed)})
+
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Return type and source of what `read` gives."""
+        return {self.name: {"source": f"axis:{self._axis.name}", "dtype": "integer", "shape": []}}
+
+    def read_configuration(self) -> Reading:
+        """Return nothing: the axis has it."""
+        return {}
+
+    def describe_configuration(self) -> dict[str, dict[str, Any]]:
+        """Return nothing: the axis has it."""
+        return {}
+
+
+class LightMeter:
+    """A light sensor: Triggerable and Readable.
+
+    A reading out of the meter's range is kept as read, marked by `<name>_good = 0`, and never used as good.
+    """
+
+    parent = None
+
+    def __init__(self, name: str, driver: LightSensor, bus: BusWorker) -> None:
+        self.name = name
+        self.driver = driver
+        self._bus = bus
+        self._identity = driver.identify()
+        self._last: LightReading | None = None
+        self._time = math.nan
+
+    @property
+    def hints(self) -> dict[str, Any]:
+        """The field worth plotting."""
+        return {"fields": [self.name]}
+
+    def trigger(self) -> Status:
+        """Take one reading; the status ends when it is there."""
+        return self._bus.call(self._acquire)
+
+    def _acquire(self) -> None:
+        self._last = None
+        self._last = self.driver.read()
+        self._time = time.time()
+
+    def read(self) -> Reading:
+        """Return what the last trigger acquired, with the time it came in."""
+        reading = self._last
+        if reading is None:
+            raise DeviceError(f"{self.name}: read before it was triggered")
+        values = {
+            self.name: float(reading.value),
+            f"{self.name}_status": int(reading.status),
+            f"{self.name}_good": int(not reading.over_range and math.isfinite(reading.value)),
+        }
+        return {key: {"value": value, "timestamp": self._time} for key, value in values.items()}
+
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Return type, unit and source of what `read` gives."""
+        source = f"sensor:{self.name}"
+        return {
+            self.name: {"source": source, "dtype": "number", "shape": [], "units": self.driver.unit},
+            f"{self.name}_status": {"source": source, "dtype": "integer", "shape": []},
+            f"{self.name}_good": {"source": source, "dtype": "integer", "shape": []},
+        }
+
+    def read_configuration(self) -> Reading:
+        """Return the meter's identity and settings."""
+        return _reading(**{f"{self.name}_{key}": value for key, value in self._configuration().items()})
+
+    def describe_configuration(self) -> dict[str, dict[str, Any]]:
+        """Return type and source of what `read_configuration` gives."""
+        return _describe_values(f"sensor:{self.name}", self.name, self._configuration())
+
+    def _configuration(self) -> dict[str, Any]:
+        return {
+            "vendor": self._identity.vendor,
+            "model": self._identity.model,
+            "serial_number": self._identity.serial_number,
+            "firmware": self._identity.firmware,
+            "integration_s": self.driver.integration_s,
+        }
+
+
+def _describe_values(source: str, prefix: str, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    return {
+        f"{prefix}_{key}": {"source": source, "dtype": "string" if isinstance(value, str) else "number", "shape": []}
+        for key, value in values.items()
+    }

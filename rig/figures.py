@@ -1,0 +1,193 @@
+"""The paper's figures 1, 2, 6, 7, 8 and 9, drawn from stored fits. Readable in print and by colour-blind people."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from rig.fits import StoredFit
+
+DARK, PALE = ("BR", "RR"), ("PR", "WR")
+SCALES = {DARK: 40.0, PALE: 400.0}
+"""Radial scales of the paper's figures 1 and 8, and 2 and 9."""
+
+TERMS = {
+    "u_diff": "epidermis, diffuse",
+    "u_spec": "epidermis, specular",
+    "s_diff": "spongy tissue, diffuse",
+    "s_spec": "spongy tissue, specular",
+}
+SPEC_ENLARGED = 5.0
+"""Figure 6 draws r'_u_spec five times enlarged."""
+
+# Okabe and Ito's palette; marker and dash tell the same apart in grey print.
+STYLES = {
+    "BR": {"color": "#000000", "marker": "o", "dashes": (None, None)},
+    "RR": {"color": "#D55E00", "marker": "s", "dashes": (6, 2)},
+    "PR": {"color": "#CC79A7", "marker": "^", "dashes": (None, None)},
+    "WR": {"color": "#0072B2", "marker": "D", "dashes": (6, 2)},
+}
+TERM_STYLES = {
+    "u_diff": {"color": "#000000", "linestyle": "-", "hatch": ""},
+    "u_spec": {"color": "#D55E00", "linestyle": "--", "hatch": "//"},
+    "s_diff": {"color": "#0072B2", "linestyle": "-.", "hatch": ".."},
+    "s_spec": {"color": "#009E73", "linestyle": ":", "hatch": "xx"},
+}
+
+Drawer = Callable[["Figure"], None]
+
+
+def draw_all(fits: Mapping[str, "StoredFit"], folder: Path) -> list[Path]:
+    """Draw the six figures as PNG and SVG into `folder` and return the files.
+
+    Parameters
+    ----------
+    fits : mapping of cultivar (BR, RR, PR, WR) to its fit
+        All of one incidence.
+    folder : Path
+        Made where it is not there.
+    """
+    simulated = any(fit.simulated for fit in fits.values())
+    dark, pale = ([fits[name] for name in group] for group in (DARK, PALE))
+    drawers: dict[str, tuple[Drawer, tuple[float, float]]] = {
+        "figure-1": (lambda f: _polar_fits(f, dark, SCALES[DARK], model=False), (6, 4.2)),
+        "figure-2": (lambda f: _polar_fits(f, pale, SCALES[PALE], model=False), (6, 4.2)),
+        "figure-6": (lambda f: _lobes(f, fits["RR"]), (6, 4.2)),
+        "figure-7": (lambda f: _coefficients(f, list(fits.values())), (7, 4.2)),
+        "figure-8": (lambda f: _polar_fits(f, dark, SCALES[DARK], model=True), (6, 4.2)),
+        "figure-9": (lambda f: _polar_fits(f, pale, SCALES[PALE], model=True), (6, 4.2)),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, (draw, size) in drawers.items():
+        # Figure 6 is the model alone: nothing in it was measured.
+        with _figure(size, simulated=simulated and name != "figure-6") as figure:
+            draw(figure)
+            for ending in ("png", "svg"):
+                path = folder / f"{name}.{ending}"
+                figure.savefig(path, dpi=160, metadata={"Date": None} if ending == "svg" else None)
+                written.append(path)
+    return written
+
+
+@contextmanager
+def _figure(size: tuple[float, float], *, simulated: bool) -> Iterator["Figure"]:
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    with mpl.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "rig", "axes.titlesize": 10}):
+        figure = Figure(figsize=size, layout="constrained")
+        yield_figure = figure
+        yield yield_figure
+        if simulated:
+            figure.text(0.995, 0.012, "SIMULATED", ha="right", va="bottom", fontsize=13, fontweight="bold", color="#B00000")
+
+
+def _polar_axes(figure: "Figure", scale: float, theta_i: float, unit: str) -> Any:
+    """Return a half disc, the normal upwards, the light's side to the right, with L drawn in."""
+    axes: Any = figure.add_subplot(projection="polar")
+    axes.set_theta_zero_location("N")
+    axes.set_theta_direction(-1)
+    axes.set_thetalim(-math.pi / 2, math.pi / 2)
+    axes.set_rlim(0, scale)
+    axes.set_rticks([scale * i / 4 for i in range(1, 5)])
+    axes.set_thetagrids(range(-90, 91, 30))
+    axes.grid(color="0.85", linewidth=0.6)
+    light = math.radians(theta_i)
+    # L points towards the light.
+    axes.annotate(
+        "", xy=(light, scale), xytext=(0, 0), arrowprops={"arrowstyle": "-|>", "color": "0.35", "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
+    )
+    axes.text(light + math.radians(3.5), scale * 0.93, "L", fontweight="bold", color="0.25", ha="center", va="center")
+    axes.text(
+        0.5,
+        -0.04,
+        f"reflected light by angle $\\theta_r$, scale {scale:g}{f' {unit}' if unit else ''}",
+        transform=axes.transAxes,
+        ha="center",
+        va="top",
+    )
+    return axes
+
+
+def _scale(fits: Sequence["StoredFit"], wanted: float) -> float:
+    """Return the paper's scale, or a multiple of it where the readings would not fit."""
+    largest = max(max(*fit.fit.measured, *fit.fit.modelled) for fit in fits)
+    return wanted * max(1, math.ceil(largest / wanted))
+
+
+def _polar_fits(figure: "Figure", fits: Sequence["StoredFit"], scale: float, *, model: bool) -> None:
+    axes = _polar_axes(figure, _scale(fits, scale), float(np.median(fits[0].fit.theta_i_deg)), fits[0].fit.unit)
+    for stored in fits:
+        fit, style = stored.fit, STYLES[stored.label]
+        order = np.argsort(fit.theta_r_deg)
+        angles, measured = np.radians(np.asarray(fit.theta_r_deg))[order], np.asarray(fit.measured)[order]
+        marks: dict[str, Any] = {"color": style["color"], "marker": style["marker"], "markersize": 4.5}
+        if model:
+            axes.plot(angles, measured, **marks, linestyle="none", markerfacecolor="white", label=f"{stored.label} measured")
+            fine = np.linspace(min(fit.theta_r_deg), max(fit.theta_r_deg), 141)
+            line = fit.predict(np.full(fine.size, np.median(fit.theta_i_deg)), fine)
+            axes.plot(
+                np.radians(fine),
+                line,
+                color=style["color"],
+                dashes=style["dashes"],
+                linewidth=1.3,
+                label=f"{stored.label} model, E {fit.E_mean:.1f} %",
+            )
+        else:
+            axes.plot(angles, measured, **marks, dashes=style["dashes"], linewidth=1.3, label=stored.label)
+    axes.legend(loc="upper left", bbox_to_anchor=(-0.12, 1.02), frameon=False)
+
+
+def _lobes(figure: "Figure", stored: "StoredFit") -> None:
+    from fitting.paper import paper_terms
+
+    theta_i = float(np.median(stored.fit.theta_i_deg))
+    fine = np.arange(-89.0, 89.5, 1.0)
+    terms = paper_terms(np.full(fine.size, theta_i), fine, aspect=stored.fit.aspect)
+    axes = _polar_axes(figure, 1.0, theta_i, "")
+    for (name, text), column in zip(TERMS.items(), terms.T, strict=True):
+        enlarged = SPEC_ENLARGED if name == "u_spec" else 1.0
+        style = TERM_STYLES[name]
+        axes.plot(
+            np.radians(fine),
+            column * enlarged,
+            color=style["color"],
+            linestyle=style["linestyle"],
+            linewidth=1.5,
+            label=f"$r'_{{{name.replace('_', ',')}}}$ {text}{f' (x{enlarged:g})' if enlarged != 1 else ''}",
+        )
+    axes.set_title(f"aspect {stored.fit.aspect:g}", loc="right", fontsize=9)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, ncols=2)
+
+
+def _coefficients(figure: "Figure", fits: Sequence["StoredFit"]) -> None:
+    axes = figure.add_subplot()
+    width = 0.8 / len(TERMS)
+    for i, (name, text) in enumerate(TERMS.items()):
+        style = TERM_STYLES[name]
+        heights = [stored.fit.x[name] for stored in fits]
+        places = np.arange(len(fits)) + (i - 1.5) * width
+        axes.bar(
+            places,
+            heights,
+            width * 0.92,
+            facecolor=style["color"] if not style["hatch"] else "white",
+            edgecolor=style["color"],
+            hatch=style["hatch"],
+            label=f"$x_{{{name.replace('_', ',')}}}$ {text}",
+        )
+        for place, height in zip(places, heights, strict=True):
+            axes.annotate(f"{height:.3g}", (place, height), textcoords="offset points", xytext=(0, 2), ha="center", fontsize=7)
+    axes.set_xticks(range(len(fits)), [stored.label for stored in fits])
+    axes.set_ylabel(f"coefficient{f', {fits[0].fit.unit}' if fits[0].fit.unit else ''}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(y=0.1)
+    axes.legend(frameon=False, loc="upper left")
