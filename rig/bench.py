@@ -7,11 +7,13 @@ from typing import Any
 
 from drivers import catalogue
 from drivers.errors import DeviceError
+from drivers.kinds import LightSensor, RotaryAxis
 from drivers.link import Link
 from rig.bus import BusWorker
 from rig.clock import Clock
 from rig.config import ANGLES, AxisConfig, BenchConfig
 from rig.devices import Axis, LightMeter
+from rig.errors import ConfigError
 from rig.interlock import Interlock
 from rig.simulation import simulated_bench
 
@@ -72,12 +74,13 @@ def open_bench(config: BenchConfig, specimen: str) -> Iterator[Bench]:
     with ExitStack() as stack:
         simulated = stack.enter_context(simulated_bench(config, specimen)) if config.simulated else None
         clock = Clock(config.simulation.speed if config.simulation else 1.0)
+        models = catalogue.load()
         links: dict[str, tuple[Link, BusWorker]] = {}
 
         def connect(model: str, port: str, serial: Mapping[str, Any]) -> tuple[Link, BusWorker]:
             if port not in links:
                 url = simulated.url(port) if simulated else port
-                link = catalogue.lookup(model).open_link(url, timeout_s=LINK_TIMEOUT_S, **serial)
+                link = models.lookup(model).open_link(url, timeout_s=LINK_TIMEOUT_S, **serial)
                 stack.callback(link.close)
                 worker = BusWorker(port, clock)
                 stack.callback(worker.close)
@@ -87,21 +90,25 @@ def open_bench(config: BenchConfig, specimen: str) -> Iterator[Bench]:
         sensor = config.sensor
         meter_link, meter_worker = connect(sensor.model, sensor.port, sensor.serial)
         stage_links = {name: connect(axis.model, axis.port, axis.serial) for name, axis in config.axes.items()}
-        meter_driver = catalogue.lookup(sensor.model).open_device(meter_link, name="meter", **sensor.options)
-        meter_driver.configure(sensor.integration_s)
+        meter_driver = models.lookup(sensor.model).open_device(meter_link, name="meter", **sensor.options)
+        if not isinstance(meter_driver, LightSensor):
+            raise ConfigError(f"{config.source}: sensor.model: {sensor.model} is not a light sensor")
+        meter_driver.configure(sensor.integration_s, sensor.range)
         axes: dict[str, Axis] = {}
         meter = LightMeter("current", meter_driver, meter_worker)
         bench = Bench(config, axes, meter, clock, simulated.parameters if simulated else None)
         stack.callback(bench.stop)
         for name, axis in config.axes.items():
             link, worker = stage_links[name]
-            stage = catalogue.lookup(axis.model).open_device(link, name=name, **axis.options)
+            stage = models.lookup(axis.model).open_device(link, name=name, **axis.options)
+            if not isinstance(stage, RotaryAxis):
+                raise ConfigError(f"{config.source}: axes.{name}.model: {axis.model} is not a rotary axis")
             stage.set_profile(speed_deg_s=axis.speed_deg_s, acceleration_deg_s2=axis.acceleration_deg_s2)
             axes[name] = _axis(axis, stage, bench, worker)
         yield bench
 
 
-def _axis(config: AxisConfig, stage: Any, bench: Bench, worker: BusWorker) -> Axis:
+def _axis(config: AxisConfig, stage: RotaryAxis, bench: Bench, worker: BusWorker) -> Axis:
     interlock: Interlock = bench.config.interlock
 
     def check(axis: str, target_deg: float) -> None:

@@ -38,11 +38,12 @@ class AxisConfig:
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """The light sensor: which one, where it hangs, how long it looks (seconds)."""
+    """The light sensor: which one, where it hangs, how long it looks (seconds), its full scale (its unit; None: it chooses)."""
 
     model: str
     port: str
     integration_s: float
+    range: float | None
     options: Mapping[str, Any]
     serial: Mapping[str, Any]
 
@@ -142,7 +143,7 @@ def parse_config(text: str, source: str) -> BenchConfig:
 
 
 def _axis(name: str, table: "_Table") -> AxisConfig:
-    model, options, serial = _device(table, "rotary-axis")
+    model, options, serial = _device(table, "rotary-axis", frozenset({"speed_deg_s", "acceleration_deg_s2"}))
     low, high = table.pair("limits")
     if low >= high:
         raise table.error("limits", f"[{low:g}, {high:g}] are swapped: give [lowest, highest] in degrees")
@@ -167,10 +168,10 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
 
 
 def _sensor(table: "_Table") -> SensorConfig:
-    model, options, serial = _device(table, "light-sensor")
+    model, options, serial = _device(table, "light-sensor", frozenset({"integration_s", "range"}))
     integration = table.positive("integration", default=0.1)
     assert integration is not None
-    config = SensorConfig(model, table.text("port"), integration, options, serial)
+    config = SensorConfig(model, table.text("port"), integration, table.positive("range", default=None), options, serial)
     table.done()
     return config
 
@@ -189,18 +190,33 @@ def _simulation(table: "_Table") -> Simulation:
     return Simulation(speed, None if seed is None else int(seed))
 
 
-def _device(table: "_Table", kind: str) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Return model, the model's own options and the serial settings that `table` gives."""
+def _device(table: "_Table", kind: str, owned: frozenset[str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Return model, the model's own options and the line settings that `table` gives; `owned` options have keys of ours."""
     from drivers import catalogue
+    from drivers.errors import InvalidSetting
 
-    known = {name: model for name, model in catalogue.models().items() if model.kind == kind}
+    models = catalogue.load()
+    known = sorted(name for name, model in models.models.items() if model.kind == kind)
     name = table.text("model")
     if name not in known:
-        raise table.error("model", f"unknown model {name!r}; a {kind} may be {', '.join(sorted(known))}")
-    model = known[name]
-    options = {key: table.option(key, option.type) for key, option in model.options.items() if key in table}
-    serial = {key: table.option(key, type(default)) for key, default in model.serial.items() if key in table}
-    return name, options, serial
+        problems = "".join(f"; {problem}" for problem in models.problems)
+        raise table.error("model", f"unknown model {name!r}; a {kind} may be {', '.join(known)}{problems}")
+    model = models.models[name]
+    options: dict[str, Any] = {}
+    for key, option in model.options.items():
+        if key in owned or not table.offers(key):
+            continue
+        try:
+            options[key] = option.check(table.value(key))
+        except InvalidSetting as exc:
+            raise table.error(key, f"{exc.problem} must be {exc.expected}") from exc
+    line: dict[str, Any] = {}
+    for key, default in model.line.items():
+        if table.offers(key):
+            line[key] = table.value(key)
+            if type(line[key]) is not type(default):
+                raise table.error(key, f"{line[key]!r} must be like {default!r}, the setting as delivered")
+    return name, options, line
 
 
 def _check_ports(config: BenchConfig) -> None:
@@ -225,9 +241,6 @@ class _Table:
         self._source = source
         self._path = path
         self._asked: set[str] = set()
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._values
 
     def error(self, key: str, what: str) -> ConfigError:
         return ConfigError(f"{self._source}: {self._path}{key}: {what}")
@@ -285,12 +298,13 @@ class _Table:
             raise self.error(key, f"{value!r} must be [lowest, highest] in degrees")
         return float(value[0]), float(value[1])
 
-    def option(self, key: str, kind: type) -> Any:
-        value = self._get(key, _REQUIRED, kind.__name__)
-        good = isinstance(value, int | float) and not isinstance(value, bool) if kind is float else type(value) is kind
-        if not good:
-            raise self.error(key, f"{value!r} must be {_KIND_NAMES.get(kind, kind.__name__)}")
-        return kind(value)
+    def offers(self, key: str) -> bool:
+        """Take note that `key` may stand here, and tell whether it does."""
+        self._asked.add(key)
+        return key in self._values
+
+    def value(self, key: str) -> Any:
+        return self._values[key]
 
     def done(self) -> None:
         unknown = sorted(set(self._values) - self._asked)
@@ -299,4 +313,3 @@ class _Table:
 
 
 _REQUIRED = object()
-_KIND_NAMES = {int: "a whole number", float: "a number", str: "text in quotes", bool: "true or false"}

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivers.errors import DeviceError, MoveTimeout
+from drivers.errors import MoveTimeout, NotHomed, UnexpectedReply
 from drivers.kinds import LightReading, LightSensor, RotaryAxis
 from rig.bus import BusWorker, Task
 from rig.clock import Clock
@@ -18,6 +18,9 @@ from rig.status import Status
 
 POLL_S = 0.004
 """How often an axis that should have arrived is asked again."""
+
+OUT_OF_RANGE = 9.9e37
+"""Stands for a value beyond the sensor's range, as in SCPI: JSON has no infinity. Such a reading is never good."""
 
 Reading = dict[str, dict[str, Any]]
 
@@ -221,9 +224,7 @@ class Axis:
             yield self.settle_s
         self.refresh()
         if not self._stopped and not self._homed:
-            raise DeviceError(
-                f"axis {self.name}: homing ended but the stage still has no reference; look at its warnings and home it again"
-            )
+            raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
 
     def _until_idle(self, what: str, duration: float, *, predicted: bool = True) -> Task:
         started = self._clock.monotonic()
@@ -233,7 +234,9 @@ class Axis:
             elapsed = self._clock.monotonic() - started
             if elapsed > 3 * duration + 5.0:
                 self.driver.stop()
-                raise MoveTimeout(f"axis {self.name}: {what} took {elapsed:.1f} s, expected {duration:.1f} s; the axis was stopped")
+                raise MoveTimeout(
+                    "still moving; it was stopped", device=self.name, attempt=what, expected=f"{duration:.1f} s", elapsed_s=elapsed
+                )
             yield POLL_S * self._clock.speed
 
     def _watch(self, duration: float) -> Task:
@@ -311,11 +314,11 @@ class LightMeter:
         """Return what the last trigger acquired, with the time it came in."""
         reading = self._last
         if reading is None:
-            raise DeviceError(f"{self.name}: read before it was triggered")
+            raise UnexpectedReply("read before it was triggered", device=self.name)
         values = {
-            self.name: float(reading.value),
+            self.name: float(reading.value) if math.isfinite(reading.value) else math.copysign(OUT_OF_RANGE, reading.value),
             f"{self.name}_status": int(reading.status),
-            f"{self.name}_good": int(not reading.over_range and math.isfinite(reading.value)),
+            f"{self.name}_good": int(not reading.over_range and not reading.under_range),
         }
         return {key: {"value": value, "timestamp": self._time} for key, value in values.items()}
 

@@ -27,13 +27,13 @@ SPEC_ENLARGED = 5.0
 """Figure 6 draws r'_u_spec five times enlarged."""
 
 # Okabe and Ito's palette; marker and dash tell the same apart in grey print.
-STYLES = {
+STYLES: dict[str, dict[str, Any]] = {
     "BR": {"color": "#000000", "marker": "o", "dashes": (None, None)},
     "RR": {"color": "#D55E00", "marker": "s", "dashes": (6, 2)},
     "PR": {"color": "#CC79A7", "marker": "^", "dashes": (None, None)},
     "WR": {"color": "#0072B2", "marker": "D", "dashes": (6, 2)},
 }
-TERM_STYLES = {
+TERM_STYLES: dict[str, dict[str, Any]] = {
     "u_diff": {"color": "#000000", "linestyle": "-", "hatch": ""},
     "u_spec": {"color": "#D55E00", "linestyle": "--", "hatch": "//"},
     "s_diff": {"color": "#0072B2", "linestyle": "-.", "hatch": ".."},
@@ -83,8 +83,7 @@ def _figure(size: tuple[float, float], *, simulated: bool) -> Iterator["Figure"]
 
     with mpl.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "rig", "axes.titlesize": 10}):
         figure = Figure(figsize=size, layout="constrained")
-        yield_figure = figure
-        yield yield_figure
+        yield figure
         if simulated:
             figure.text(0.995, 0.012, "SIMULATED", ha="right", va="bottom", fontsize=13, fontweight="bold", color="#B00000")
 

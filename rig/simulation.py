@@ -55,7 +55,8 @@ def simulated_bench(config: BenchConfig, specimen: str) -> Iterator[SimulatedBen
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=complaints, start_new_session=True, env=_environment()
         ) as process,
     ):
-        assert process.stdout is not None and process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdin is not None
         try:
             line = process.stdout.readline()
             try:

@@ -13,17 +13,17 @@ def fit_table(stored: StoredFit) -> str:
     source = stored.provenance.get("run") or stored.provenance.get("file")
     lines = [
         f"{SIMULATED + ': ' if stored.simulated else ''}{stored.label}: fit of {source}",
-        f"model {fit.model}, aspect {fit.aspect:g}, weights {fit.weights}, {len(fit.theta_r_deg)} geometries, in {fit.unit or 'its own unit'}",
+        f"model {fit.model}, aspect {fit.aspect:g}, weights {fit.weights}, {len(fit)} geometries, {fit.quantity} in {fit.unit}",
         "",
-        *(f"  x_{name:<7} {value:12.5g}{'   (at its bound 0)' if name in fit.active else ''}" for name, value in fit.x.items()),
+        *(f"  x_{name:<7} {value:12.5g}{'   (at its bound 0)' if name in fit.zero else ''}" for name, value in fit.x.items()),
         "",
         f"{'theta_i':>9} {'theta_r':>9} {'measured':>11} {'model':>11} {'E %':>7}",
     ]
     columns = (fit.theta_i_deg, fit.theta_r_deg, fit.measured, fit.modelled, fit.E)
     lines += [f"{ti:>9.2f} {tr:>9.2f} {m:>11.4g} {f:>11.4g} {e:>7.2f}" for ti, tr, m, f, e in zip(*columns, strict=True)]
     lines += ["", f"E: mean {fit.E_mean:.2f} %, maximum {fit.E_max:.2f} %"]
-    if fit.undetermined:
-        lines.append(f"not determined by these readings: {fit.undetermined}")
+    if not fit.determined:
+        lines.append(fit.statement)
     return "\n".join(lines)
 
 

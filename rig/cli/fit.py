@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import click
 
@@ -11,6 +12,9 @@ from rig.errors import ConfigError, RunError
 from rig.fits import StoredFit, measurements_of, new_fit, provenance_of_file, provenance_of_run, store_fit
 from rig.runs import Run, find_run, latest_run
 from rig.tables import fit_table
+
+if TYPE_CHECKING:
+    from fitting.mixture import Weights
 
 
 @click.command(
@@ -57,12 +61,12 @@ def command(
     settings: Settings,
     run_or_file: str | None,
     cultivar: str | None,
-    weights: str,
+    weights: "Weights",
     aspect: float,
     columns: tuple[str, ...],
     wheres: tuple[str, ...],
-    theta_r_positive: str,
-    quantity: str,
+    theta_r_positive: Literal["light", "forward"],
+    quantity: Literal["auto", "intensity", "reflectance-factor", "brdf"],
     as_json: bool,
 ) -> None:
     """Fit the paper's four coefficients to RUN, or to a table of others; print and store them."""
@@ -91,7 +95,7 @@ def command(
     click.echo(f"stored in {path}", err=True)
 
 
-def fit_run(run: Run, weights: str = "relative", aspect: float = 0.5) -> StoredFit:
+def fit_run(run: Run, weights: "Weights" = "relative", aspect: float = 0.5) -> StoredFit:
     """Return the fit of `run`, not stored yet."""
     from fitting.mixture import fit_mixture
 
@@ -117,11 +121,13 @@ def _is_table(name: str) -> bool:
 
 
 def _pairs(options: tuple[str, ...], name: str) -> dict[str, str]:
-    pairs = [option.split("=", 1) for option in options]
-    for pair, option in zip(pairs, options, strict=True):
-        if len(pair) != 2 or not all(pair):
+    pairs = {}
+    for option in options:
+        key, equals, value = option.partition("=")
+        if not (key and equals and value):
             raise ConfigError(f"{name} {option!r}: expected NAME=VALUE")
-    return {key: value for key, value in pairs}
+        pairs[key] = value
+    return pairs
 
 
 def _label(path: Path) -> str:

@@ -15,7 +15,7 @@ def command() -> None:
 
 @command.command(
     "eval",
-    epilog="\b\nExamples:\n  rig model eval --mode paper --theta-i 45 --theta-r -70:70:10\n  rig model eval --aspect 1.9 --theta-i 30 > r.csv",
+    epilog="\b\nExamples:\n  rig model eval --mode paper --theta-i 45 --theta-r -70:70:10\n  rig model eval --aspect 1.9 > r.csv",
 )
 @click.option("--mode", type=click.Choice(["paper"]), default="paper", show_default=True, help="Which of the model's modes.")
 @click.option("--theta-i", default="45", show_default=True, metavar="DEG", help="Angle of the light.")
