@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from rig.errors import RunError
 
@@ -52,7 +52,7 @@ class JournalWriter:
         self._abort_reason = abort_reason
         new = not path.exists()
         try:
-            self._file: IO[bytes] = path.open("ab")
+            self._file = path.open("ab", buffering=0)
             if not new and path.stat().st_size and not _ends_with_newline(path):
                 self._file.write(b"\n")
             if new:
@@ -66,8 +66,9 @@ class JournalWriter:
             doc = {**doc, "reason": self._abort_reason()}
         line = json.dumps({"name": str(name), "doc": _plain(doc, str(name))}, allow_nan=False) + "\n"
         try:
-            self._file.write(line.encode())
-            self._file.flush()
+            rest = memoryview(line.encode())
+            while rest:
+                rest = rest[self._file.write(rest) :]
             os.fsync(self._file.fileno())
         except OSError as exc:
             raise RunError(f"{self.path}: the journal cannot be written: {exc.strerror}; the run ends here") from exc

@@ -1,0 +1,1 @@
+"""Benchmarks: they print figures and ratios; none is a test."""
