@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from drivers.errors import MoveTimeout, NotHomed, UnexpectedReply
+from drivers.errors import DeviceFault, MoveTimeout, NotHomed, UnexpectedReply
 from drivers.kinds import LightReading, LightSensor, RotaryAxis
 from rig.bus import BusWorker, Task
 from rig.clock import Clock
@@ -135,8 +135,8 @@ class Axis:
         InterlockError
             Where the axis may not go there; nothing was moved.
         """
+        self.check_value(value)
         target = float(value)
-        self.check_value(target)
         return self._begin(self._move(target), target)
 
     def home(self) -> Status:
@@ -202,11 +202,8 @@ class Axis:
         if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance_deg:
             return
         duration = self._profile.duration_s(abs(self._readback - target))
-        if self._stopped:
+        if not self._started(lambda: self.driver.start_move(axis_deg)):
             return
-        self.driver.start_move(axis_deg)
-        if self._stopped:  # the stop came while the command was on its way
-            self.driver.stop()
         yield from self._until_idle(f"the move to {target:g} deg", duration)
         if not self._stopped:
             self.driver.check_arrival(axis_deg, self.tolerance_deg)
@@ -214,17 +211,28 @@ class Axis:
         self.refresh()
 
     def _home(self) -> Task:
-        if self._stopped:
+        if not self._started(self.driver.start_home):
             return
-        self.driver.start_home()
-        if self._stopped:
-            self.driver.stop()
         yield from self._until_idle("homing", self._profile.duration_s(360.0), predicted=False)
         if not self._stopped:
             yield self.settle_s
         self.refresh()
         if not self._stopped and not self._homed:
             raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
+
+    def _started(self, start: Callable[[], None]) -> bool:
+        """Start a motion unless a stop was asked for meanwhile; return whether it runs."""
+        if self._stopped:
+            return False
+        try:
+            start()
+        except DeviceFault:
+            if self._stopped:  # the driver would not let it follow the stop
+                return False
+            raise
+        if self._stopped:  # the stop overtook the start before the driver could know
+            self.driver.stop()
+        return True
 
     def _until_idle(self, what: str, duration: float, *, predicted: bool = True) -> Task:
         started = self._clock.monotonic()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from bluesky.run_engine import RunEngine
-from bluesky.utils import Msg, RunEngineInterrupted
+from bluesky.utils import FailedStatus, Msg, RunEngineInterrupted
 
 from rig.errors import Interrupted
 
@@ -127,6 +127,8 @@ def run_plan(
     ------
     Interrupted
         Where the run was aborted.
+    Exception
+        What a device, a callback or the plan raised; the run is closed as failed.
     """
     log = logging.getLogger("bluesky")
     propagate, log.propagate = log.propagate, False
@@ -141,6 +143,8 @@ def run_plan(
             with interrupts.watching(engine):
                 interrupts.check()
                 _run(engine, plan, interrupts, decide)
+        except FailedStatus as failed:
+            raise failed.__cause__ or failed from None  # what the device said
         finally:
             _end_loop(engine)
     finally:
@@ -199,6 +203,7 @@ def _by_text(callback: Callable[[str, dict[str, Any]], Any]) -> Callable[[Any, d
 
 
 def _end_loop(engine: RunEngine) -> None:
-    """Stop the engine's loop thread, so that nothing outlives the sweep."""
+    """Stop the engine's loop and its thread, so that nothing outlives the sweep."""
     engine.loop.call_soon_threadsafe(engine.loop.stop)
-    engine._th.join(5)
+    engine._th.join()
+    engine.loop.close()

@@ -1,5 +1,6 @@
 """The promise a device gives when it starts something that takes time."""
 
+import logging
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -20,6 +21,10 @@ class Status:
         self._lock = threading.Lock()
         self._exception: BaseException | None = None
         self._callbacks: list[Callable[[Status], Any]] = []
+
+    def __repr__(self) -> str:
+        # The engine gives this as the reason why a run failed.
+        return f"<Status: {self._exception or 'done'}>" if self.done else "<Status: under way>"
 
     @property
     def done(self) -> bool:
@@ -66,5 +71,9 @@ class Status:
             callbacks, self._callbacks = self._callbacks, []
             self._done.set()
         for callback in callbacks:
-            callback(self)
+            # A listener that has gone (an engine whose loop is closed) must not stop the others, nor the bus that finished this.
+            try:
+                callback(self)
+            except Exception:
+                logging.getLogger(__name__).debug("a listener failed", exc_info=True)
         return True

@@ -60,9 +60,12 @@ def test_an_installed_rig_works_with_its_data_files(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "rig", *arguments]
         return subprocess.run(command, cwd=work, env=environment, capture_output=True, text=True, check=True).stdout
 
-    assert str(tmp_path / "site") in subprocess.run(
-        [sys.executable, "-c", "import rig; print(rig.__file__)"], cwd=work, env=environment, capture_output=True, text=True, check=True
-    ).stdout
+    assert (
+        str(tmp_path / "site")
+        in subprocess.run(
+            [sys.executable, "-c", "import rig; print(rig.__file__)"], cwd=work, env=environment, capture_output=True, text=True, check=True
+        ).stdout
+    )
     rig("init", "--out", "mine.toml")
     rig("sweep", "--cultivar", "WR", "--theta-r", "-40:40:40")
     assert "WR" in rig("runs")

@@ -25,7 +25,7 @@ def main() -> int:
     acknowledged = lost = unreadable = orphans = 0
     with tempfile.TemporaryDirectory() as folder:
         for number in range(TIMES):
-            rows, run = killed_sweep(Path(folder) / f"run-{number}", rows_before=rng.randrange(0, 27), delay=rng.uniform(0, 0.06))
+            rows, run = killed_sweep(Path(folder) / f"run-{number}", rows_before=rng.randrange(0, 23), delay=rng.uniform(0, 0.06))
             try:
                 stored = {(reading.seq, f"{reading.theta_r:.3f}") for reading in run.readings}
             except Exception as exc:
@@ -43,7 +43,7 @@ def main() -> int:
 
 def killed_sweep(out: Path, rows_before: int, delay: float) -> tuple[list[tuple[int, str]], Run]:
     """Start a sweep, kill it `delay` seconds after so many rows; return the rows that were on the screen, and the run."""
-    command = [sys.executable, "-m", "rig", "sweep", "--cultivar", "RR", "--theta-r", "-65:65:5", "--out", str(out)]
+    command = [sys.executable, "-m", "rig", "sweep", "--cultivar", "RR", "--theta-r", "-70:40:5", "--out", str(out)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=rig_environment())
     assert process.stderr is not None
     rows: list[tuple[int, str]] = []

@@ -13,7 +13,7 @@ from rig.runs import Run
 from tests.conftest import rig_environment
 
 pytestmark = pytest.mark.slow
-SWEEP = ["-m", "rig", "sweep", "--cultivar", "RR", "--theta-r", "-65:65:5", "--out"]
+SWEEP = ["-m", "rig", "sweep", "--cultivar", "RR", "--theta-r", "-70:40:5", "--out"]
 
 
 def at_terminal(folder: Path) -> pexpect.spawn:
@@ -35,7 +35,7 @@ def test_at_a_terminal_the_first_one_pauses_and_asks_and_go_on_completes_the_run
     assert child.exitstatus == 0
     run = Run(tmp_path / "run")
     assert run.state == "complete"
-    assert [reading.theta_r_setpoint for reading in run.readings] == [float(v) for v in range(-65, 66, 5)]
+    assert [reading.theta_r_setpoint for reading in run.readings] == [float(v) for v in range(-70, 41, 5)]
 
 
 @pytest.mark.parametrize("answer", ["a\n", "\x03"])
