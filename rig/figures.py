@@ -56,12 +56,12 @@ def draw_all(fits: Mapping[str, "StoredFit"], folder: Path) -> list[Path]:
     simulated = any(fit.simulated for fit in fits.values())
     dark, pale = ([fits[name] for name in group] for group in (DARK, PALE))
     drawers: dict[str, tuple[Drawer, tuple[float, float]]] = {
-        "figure-1": (lambda f: _polar_fits(f, dark, SCALES[DARK], model=False), (6, 4.2)),
-        "figure-2": (lambda f: _polar_fits(f, pale, SCALES[PALE], model=False), (6, 4.2)),
-        "figure-6": (lambda f: _lobes(f, fits["RR"]), (6, 4.2)),
+        "figure-1": (lambda f: _polar_fits(f, dark, SCALES[DARK], model=False), (6, 4.3)),
+        "figure-2": (lambda f: _polar_fits(f, pale, SCALES[PALE], model=False), (6, 4.3)),
+        "figure-6": (lambda f: _lobes(f, fits["RR"]), (6, 4.3)),
         "figure-7": (lambda f: _coefficients(f, list(fits.values())), (7, 4.2)),
-        "figure-8": (lambda f: _polar_fits(f, dark, SCALES[DARK], model=True), (6, 4.2)),
-        "figure-9": (lambda f: _polar_fits(f, pale, SCALES[PALE], model=True), (6, 4.2)),
+        "figure-8": (lambda f: _polar_fits(f, dark, SCALES[DARK], model=True), (6, 4.3)),
+        "figure-9": (lambda f: _polar_fits(f, pale, SCALES[PALE], model=True), (6, 4.3)),
     }
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -82,15 +82,19 @@ def _figure(size: tuple[float, float], *, simulated: bool) -> Iterator["Figure"]
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "rig", "axes.titlesize": 10}):
-        figure = Figure(figsize=size, layout="constrained")
-        yield figure
+        figure = Figure(figsize=size)
         if simulated:
-            figure.text(0.995, 0.012, "SIMULATED", ha="right", va="bottom", fontsize=13, fontweight="bold", color="#B00000")
+            figure.text(0.985, 0.975, "SIMULATED", ha="right", va="top", fontsize=13, fontweight="bold", color="#B00000")
+        yield figure
 
 
 def _polar_axes(figure: "Figure", scale: float, theta_i: float, unit: str) -> Any:
     """Return a half disc, the normal upwards, the light's side to the right, with L drawn in."""
-    axes: Any = figure.add_subplot(projection="polar")
+    # The half disc is as wide as its square box and stands in its middle: the box reaches beyond the figure.
+    width, height = figure.get_size_inches()
+    side, bottom = width - 1.2, 0.7
+    rect = ((width - side) / 2 / width, (bottom - side / 4) / height, side / width, side / height)
+    axes: Any = figure.add_axes(rect, projection="polar")
     axes.set_theta_zero_location("N")
     axes.set_theta_direction(-1)
     axes.set_thetalim(-math.pi / 2, math.pi / 2)
@@ -99,19 +103,11 @@ def _polar_axes(figure: "Figure", scale: float, theta_i: float, unit: str) -> An
     axes.set_thetagrids(range(-90, 91, 30))
     axes.grid(color="0.85", linewidth=0.6)
     light = math.radians(theta_i)
-    # L points towards the light.
-    axes.annotate(
-        "", xy=(light, scale), xytext=(0, 0), arrowprops={"arrowstyle": "-|>", "color": "0.35", "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
-    )
-    axes.text(light + math.radians(3.5), scale * 0.93, "L", fontweight="bold", color="0.25", ha="center", va="center")
-    axes.text(
-        0.5,
-        -0.04,
-        f"reflected light by angle $\\theta_r$, scale {scale:g}{f' {unit}' if unit else ''}",
-        transform=axes.transAxes,
-        ha="center",
-        va="top",
-    )
+    arrow = {"arrowstyle": "-|>", "color": "0.35", "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=(light, scale), xytext=(0, 0), arrowprops=arrow)  # L points towards the light
+    axes.text(light, scale * 1.06, "L", fontweight="bold", color="0.25", ha="center", va="center")
+    caption = f"reflected light by angle $\\theta_r$, scale {scale:g}{f' {unit}' if unit else ''}"
+    figure.text(0.5, 0.02, caption, ha="center", va="bottom")
     return axes
 
 
@@ -142,7 +138,7 @@ def _polar_fits(figure: "Figure", fits: Sequence["StoredFit"], scale: float, *, 
             )
         else:
             axes.plot(angles, measured, **marks, dashes=style["dashes"], linewidth=1.3, label=stored.label)
-    axes.legend(loc="upper left", bbox_to_anchor=(-0.12, 1.02), frameon=False)
+    figure.legend(loc="upper left", bbox_to_anchor=(0.0, 1.0), frameon=False)
 
 
 def _lobes(figure: "Figure", stored: "StoredFit") -> None:
@@ -163,30 +159,30 @@ def _lobes(figure: "Figure", stored: "StoredFit") -> None:
             linewidth=1.5,
             label=f"$r'_{{{name.replace('_', ',')}}}$ {text}{f' (x{enlarged:g})' if enlarged != 1 else ''}",
         )
-    axes.set_title(f"aspect {stored.fit.aspect:g}", loc="right", fontsize=9)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), frameon=False, ncols=2)
+    figure.text(0.985, 0.975, f"aspect {stored.fit.aspect:g}", ha="right", va="top")
+    figure.legend(loc="upper left", bbox_to_anchor=(0.0, 1.0), frameon=False)
 
 
 def _coefficients(figure: "Figure", fits: Sequence["StoredFit"]) -> None:
-    axes = figure.add_subplot()
+    axes = figure.subplots()
+    figure.subplots_adjust(left=0.1, right=0.985, top=0.8, bottom=0.08)
+    # Logarithmic: r'_u_spec is small where cells scatter the mirror image, so its coefficient is large.
+    positive = [value for stored in fits for value in stored.fit.x.values() if value > 0]
+    floor = 10.0 ** (math.floor(math.log10(min(positive))) - 0.3) if positive else 0.1
+    axes.set_yscale("log")
+    axes.set_ylim(floor, 4 * max(positive, default=1.0))
     width = 0.8 / len(TERMS)
     for i, (name, text) in enumerate(TERMS.items()):
         style = TERM_STYLES[name]
         heights = [stored.fit.x[name] for stored in fits]
         places = np.arange(len(fits)) + (i - 1.5) * width
-        axes.bar(
-            places,
-            heights,
-            width * 0.92,
-            facecolor=style["color"] if not style["hatch"] else "white",
-            edgecolor=style["color"],
-            hatch=style["hatch"],
-            label=f"$x_{{{name.replace('_', ',')}}}$ {text}",
-        )
+        face = "white" if style["hatch"] else style["color"]
+        label = f"$x_{{{name.replace('_', ',')}}}$ {text}"
+        axes.bar(places, heights, width * 0.92, facecolor=face, edgecolor=style["color"], hatch=style["hatch"], label=label)
         for place, height in zip(places, heights, strict=True):
-            axes.annotate(f"{height:.3g}", (place, height), textcoords="offset points", xytext=(0, 2), ha="center", fontsize=7)
+            text_at = (place, max(height, floor))
+            axes.annotate(f"{height:.3g}", text_at, textcoords="offset points", xytext=(0, 2), ha="center", fontsize=7)
     axes.set_xticks(range(len(fits)), [stored.label for stored in fits])
     axes.set_ylabel(f"coefficient{f', {fits[0].fit.unit}' if fits[0].fit.unit else ''}")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(y=0.1)
-    axes.legend(frameon=False, loc="upper left")
+    figure.legend(frameon=False, loc="upper left", ncols=2)

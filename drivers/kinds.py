@@ -1,0 +1,229 @@
+"""What a rotary axis and a light sensor can do, whoever made them, and the values they hand over."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from drivers.errors import InvalidSetting
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who the instrument says it is."""
+
+    vendor: str
+    model: str
+    serial_number: str
+    firmware: str
+
+
+@dataclass(frozen=True)
+class AxisState:
+    """One look at an axis.
+
+    Attributes
+    ----------
+    position_deg : float, deg
+        Readback.
+    moving : bool
+        Whether the axis is busy.
+    homed : bool
+        Whether the axis has a reference position.
+    warnings : tuple of str
+        Warning flags in the device's own spelling, all that are set.
+    """
+
+    position_deg: float
+    moving: bool
+    homed: bool
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MotionProfile:
+    """How fast an axis goes.
+
+    Attributes
+    ----------
+    speed_deg_s : float, deg/s
+    acceleration_deg_s2 : float, deg/s^2
+        Of the ramp up and of the ramp down.
+
+    Raises
+    ------
+    InvalidSetting
+        If either is not finite and above 0.
+    """
+
+    speed_deg_s: float
+    acceleration_deg_s2: float
+
+    def __post_init__(self) -> None:
+        for what, value in (("speed", self.speed_deg_s), ("acceleration", self.acceleration_deg_s2)):
+            if not (math.isfinite(value) and value > 0):
+                raise InvalidSetting(f"{what} {value}", expected="a finite number above 0")
+
+    def duration_s(self, distance_deg: float) -> float:
+        """Time to travel a distance (deg, either sign) from rest to rest, in s.
+
+        A trapezoid of velocity, or a triangle when the distance is too short to reach full speed.
+        """
+        distance = abs(distance_deg)
+        ramps = self.speed_deg_s**2 / self.acceleration_deg_s2  # travelled in the two ramps together
+        if distance >= ramps:
+            return distance / self.speed_deg_s + self.speed_deg_s / self.acceleration_deg_s2
+        return 2 * math.sqrt(distance / self.acceleration_deg_s2)
+
+
+@dataclass(frozen=True)
+class LightReading:
+    """One reading of a light sensor.
+
+    Attributes
+    ----------
+    value : float
+        In `unit`; +inf or -inf when over range, so that it can never pass for a good value.
+    unit : str
+    status : int
+        The device's status word.
+    over_range : bool
+        The light was too strong for the range.
+    under_range : bool
+        The light was too weak for the range; `value` is what the device said.
+    device_time_s : float, s, optional
+        The device's own clock, if it has one; it may wrap.
+    flags : tuple of str
+        Names of the status bits that are set.
+
+    Raises
+    ------
+    InvalidSetting
+        If value and over_range contradict each other.
+    """
+
+    value: float
+    unit: str
+    status: int
+    over_range: bool
+    under_range: bool = False
+    device_time_s: float | None = None
+    flags: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if math.isnan(self.value) or math.isinf(self.value) != self.over_range:
+            raise InvalidSetting(f"reading {self.value} with over_range={self.over_range}", expected="infinite if and only if over range")
+
+    @property
+    def good(self) -> bool:
+        """Whether the value can be used as a measurement."""
+        return not (self.over_range or self.under_range)
+
+
+@runtime_checkable
+class RotaryAxis(Protocol):
+    """A motorised rotation. Calls block for one exchange, not for a motion; any thread may call."""
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        ...
+
+    def identify(self) -> Identity:
+        """Ask the device who it is."""
+        ...
+
+    def state(self) -> AxisState:
+        """Ask where the axis is and what it is doing."""
+        ...
+
+    def limits_deg(self) -> tuple[float, float]:
+        """The device's own lower and upper limit, deg."""
+        ...
+
+    def profile(self) -> MotionProfile:
+        """Read speed and acceleration from the device."""
+        ...
+
+    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
+        """Set speed (deg/s), acceleration (deg/s^2) or both in the device."""
+        ...
+
+    def start_home(self) -> None:
+        """Start the search for the reference position and return at once."""
+        ...
+
+    def start_move(self, deg: float) -> None:
+        """Start moving to an angle (deg) and return at once.
+
+        Raises
+        ------
+        NotHomed
+            The axis has no reference position.
+        DeviceFault
+            The device refuses, for instance because the angle is beyond its limits.
+        """
+        ...
+
+    def stop(self) -> None:
+        """Stop the axis now: the bytes go out even while another thread waits on the link. Stopping twice is harmless."""
+        ...
+
+    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
+        """Make sure that the axis rests at an angle (deg) because it got there.
+
+        Raises
+        ------
+        DeviceFault
+            Something else stopped it (a stall, a limit switch, a hand on the knob), or it rests elsewhere.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the device. The link stays open for the others on it."""
+        ...
+
+
+@runtime_checkable
+class LightSensor(Protocol):
+    """Something that turns light into a number."""
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of the readings."""
+        ...
+
+    @property
+    def integration_s(self) -> float:
+        """Integration time in s, as configured after rounding to what the device can do."""
+        ...
+
+    def identify(self) -> Identity:
+        """Ask the device who it is."""
+        ...
+
+    def configure(self, integration_s: float, range: float | None = None) -> None:
+        """Set the integration time (s) and the range (full scale, in `unit`; None for automatic).
+
+        Raises
+        ------
+        InvalidSetting
+            The device cannot do that; nothing was sent.
+        DeviceFault
+            The device refuses.
+        """
+        ...
+
+    def read(self) -> LightReading:
+        """Take one reading; blocks for the integration."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the device. The link stays open for the others on it."""
+        ...
