@@ -1,0 +1,78 @@
+"""The demo as a whole, and what its figures say."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+NUMBERS = (1, 2, 6, 7, 8, 9)
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    import subprocess
+    import sys
+
+    from tests.conftest import rig_environment
+
+    folder = tmp_path_factory.mktemp("demo")
+    done = subprocess.run([sys.executable, "-m", "rig", "demo"], cwd=folder, env=rig_environment(), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return folder / "rig-data", done.stdout
+
+
+def texts(svg: Path) -> str:
+    return " ".join("".join(element.itertext()) for element in ET.parse(svg).iter("{http://www.w3.org/2000/svg}text"))
+
+
+@pytest.mark.slow
+def test_the_closing_table_names_x_and_e_of_every_cultivar_and_where_all_lies(demo: tuple[Path, str]) -> None:
+    workspace, said = demo
+    rows = {words[0]: words for line in said.splitlines() if (words := line.split()) and words[0] in ("BR", "RR", "PR", "WR")}
+    assert list(rows) == ["BR", "RR", "PR", "WR"]
+    assert "SIMULATED" in said
+    for folder in ("runs", "fits", "figures"):
+        assert re.search(rf"^{folder} +rig-data/{folder}$", said, re.MULTILINE)
+    stored = {fit["label"]: fit for fit in (json.loads(path.read_text()) for path in (workspace / "fits").glob("*.json"))}
+    for label, words in rows.items():
+        assert [float(word) for word in words[1:7]] == pytest.approx(
+            [*stored[label]["x"].values(), stored[label]["E_mean"], stored[label]["E_max"]], rel=1e-3
+        )
+
+
+@pytest.mark.slow
+def test_the_papers_phenomenon_is_in_the_readings(demo: tuple[Path, str]) -> None:
+    _, said = demo
+    ratios = [float(re.search(rf"^{label} .* ([\d.]+) +20", said, re.MULTILINE)[1]) for label in ("BR", "RR", "PR", "WR")]  # type: ignore[index]
+    assert ratios == sorted(ratios, reverse=True)
+    assert ratios[0] > 1.5
+    assert ratios[-1] < 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", NUMBERS)
+def test_every_plot_of_simulated_readings_says_so(demo: tuple[Path, str], number: int) -> None:
+    workspace, _ = demo
+    said = texts(workspace / "figures" / f"figure-{number}.svg")
+    assert ("SIMULATED" in said) is (number != 6)  # figure 6 is the model alone
+    assert (workspace / "figures" / f"figure-{number}.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (1, ("BR", "RR", "scale 40")),
+        (2, ("PR", "WR", "scale 400")),
+        (6, ("x5",)),
+        (8, ("BR model", "scale 40")),
+        (9, ("WR measured", "scale 400")),
+    ],
+)
+def test_the_figures_are_the_papers(demo: tuple[Path, str], number: int, words: tuple[str, ...]) -> None:
+    workspace, _ = demo
+    said = texts(workspace / "figures" / f"figure-{number}.svg")
+    for word in words:
+        assert word in said

@@ -1,0 +1,142 @@
+"""Sockets and pseudo-terminals: whole lines, comings and goings, noise, more than one client."""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import serial
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim.serve import Running
+from sim.wire import Splitter
+
+Connect = Callable[[str], Any]
+
+
+@given(st.lists(st.binary(max_size=8).filter(lambda piece: b"\r" not in piece and b"\n" not in piece)), st.data())
+def test_splitter_gives_the_same_messages_however_the_stream_is_cut(messages: list[bytes], data: st.DataObject) -> None:
+    ends = [data.draw(st.sampled_from([b"\r", b"\n", b"\r\n", b"\n\r"])) for _ in messages]
+    stream = b"".join(message + end for message, end in zip(messages, ends, strict=True))
+    splitter, rest = Splitter(8), stream
+    got: list[bytes] = []
+    while rest:
+        size = data.draw(st.integers(1, len(rest)))
+        got += splitter.feed(rest[:size])
+        rest = rest[size:]
+    assert got == [message for message in messages if message]
+    assert splitter.overruns == 0
+
+
+def test_splitter_drops_a_message_that_is_too_long_and_takes_the_next() -> None:
+    splitter = Splitter(8)
+    assert list(splitter.feed(b"12345678\n123456789\nok\n")) == [b"12345678", b"ok"]
+    assert list(splitter.feed(b"12345")) == list(splitter.feed(b"67890")) == []
+    assert list(splitter.feed(b"x\nok\n")) == [b"ok"]
+    assert splitter.overruns == 2
+
+
+def open_pty(path: str) -> serial.Serial:
+    return serial.Serial(path, 115200, timeout=10)
+
+
+def ask(port: serial.Serial, line: bytes) -> bytes:
+    port.write(line + b"\n")
+    return port.read_until(b"\n")
+
+
+def test_tcp_byte_by_byte_and_many_at_once(running: Running, connect: Connect) -> None:
+    client = connect(running.url("stages"))
+    for byte in b"/1 0 33\r\n":
+        client.send(bytes([byte]))
+    assert client.line() == b"@01 0 33 OK IDLE WR 0\r\n"
+    client.send(b"".join(b"/2 0 %02d\n" % i for i in range(100)))
+    assert [client.line() for _ in range(100)] == [b"@02 0 %02d OK IDLE WR 0\r\n" % i for i in range(100)]
+
+
+def test_pty_and_tcp_share_one_instrument(running: Running, connect: Connect) -> None:
+    client = connect(running.url("stages"))
+    with open_pty(running.pty("stages")) as port:
+        assert client.ask(b"/1 1 set maxspeed 12345") == b"@01 1 OK IDLE WR 0\r\n"
+        assert ask(port, b"/1 1 get maxspeed") == b"@01 1 OK IDLE WR 12345\r\n"
+    other = connect(running.url("stages"))
+    assert other.ask(b"/1 1 get maxspeed") == b"@01 1 OK IDLE WR 12345\r\n"
+
+
+def test_a_pty_neither_echoes_nor_translates(running: Running) -> None:
+    fd = os.open(running.pty("stages"), os.O_RDWR | os.O_NOCTTY)  # with the terminal settings as they are
+    try:
+        os.write(fd, b"/1 0 01\n/1 0 02\r")
+        got = b""
+        while got.count(b"\n") < 2:
+            got += os.read(fd, 100)
+        assert got == b"@01 0 01 OK IDLE WR 0\r\n@01 0 02 OK IDLE WR 0\r\n"
+    finally:
+        os.close(fd)
+
+
+def test_clients_come_and_go_and_leave_nothing_behind(running: Running, connect: Connect) -> None:
+    for i in range(5):
+        with open_pty(running.pty("stages")) as port:
+            assert ask(port, b"/1 0 %02d" % i) == b"@01 0 %02d OK IDLE WR 0\r\n" % i
+            port.write(b"/1 0 98\n/1 1 home no")  # a question whose answer is not stayed for, and half a command
+        client = connect(running.url("stages"))
+        assert client.ask(b"/2 0 %02d" % i) == b"@02 0 %02d OK IDLE WR 0\r\n" % i
+        client.send(b"/2 1 hom")
+        client.close()
+    client = connect(running.url("stages"))
+    assert client.ask(b"/0 1 07").split()[5] == b"WR"
+
+
+def test_a_pty_client_that_does_not_read_holds_nobody_else_up(running: Running, connect: Connect) -> None:
+    with open_pty(running.pty("meter")) as port:
+        port.write(b"*IDN?\n" * 20_000)  # far more replies than the terminal holds, and more questions than the meter keeps
+        other = connect(running.url("meter"))
+        assert other.ask(b"*OPC?") == b"1\n"
+        assert other.ask(b"SYST:ERR?").startswith(b"-363,")
+    with open_pty(running.pty("meter")) as port:
+        # Opened again before the meter could notice, the line still carries what the meter had to say, as a real one would.
+        line = ask(port, b"*OPC?")
+        while line != b"1\n":
+            assert line
+            line = port.readline()
+
+
+def test_a_client_that_leaves_during_a_reading_does_not_block_the_meter(running: Running, connect: Connect) -> None:
+    client = connect(running.url("meter"))
+    client.send(b"CURR:NPLC 60;:TRIG:COUN 2500\nREAD?\n")
+    client.close()
+    other = connect(running.url("meter"))
+    assert other.ask(b"*RST;*OPC?") == b"1\n"
+
+
+def test_alerts_arrive_unasked(running: Running, connect: Connect) -> None:
+    client = connect(running.url("stages"))
+    client.ask(b"/1 set comm.alert 1")
+    assert client.ask(b"/1 1 move rel 38400").startswith(b"@01 1 OK BUSY")
+    assert client.line() == b"!01 1 IDLE WR\r\n"
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", ["stages", "meter"])
+def test_noise_on_the_wire_is_survived(running: Running, connect: Connect, name: str, seed: int) -> None:
+    rng = random.Random(seed)
+    question, answer = {"stages": (b"/1 0 42", b"@01 0 42 OK"), "meter": (b"*OPC?", b"1\n")}[name]
+    with open_pty(running.pty(name)) as port:
+        port.timeout = 0.5
+        client = connect(running.url(name))
+        for _ in range(20):
+            noise = rng.randbytes(rng.randrange(1, 3000))
+            client.send(noise + b"\n")
+            port.write(noise[:200] + b"\n")
+        client.close()
+        port.write(b"\n" + question + b"\n")
+        lines: list[bytes] = []
+        while not (lines and lines[-1].startswith(answer)):
+            lines.append(port.readline())
+            assert lines[-1], lines
+    assert connect(running.url(name)).ask(question).startswith(answer)
