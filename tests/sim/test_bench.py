@@ -146,3 +146,17 @@ def test_an_unknown_specimen_is_named(text: str) -> None:
 def test_times_must_be_in_order() -> None:
     with pytest.raises(SimError, match="later end"):
         bench().signal(1.0, 1.0)
+
+
+@pytest.mark.parametrize("name", ["BR", "RR", "PR", "WR"])
+def test_petals_lie_on_the_bench(name: str) -> None:
+    petal = specimen(name)
+    assert petal.name == name
+    world = bench(specimen=petal)
+    angles = np.array([-70.0, -40.0, 0.0, 40.0, 70.0])
+    assert world.light(45.0, angles) == pytest.approx(world.scale * petal.f_r(np.full(5, 45.0), angles) * math.cos(math.pi / 4))
+    assert world.light(-45.0, -angles) == pytest.approx(world.light(45.0, angles))
+    # Wherever an arm may stand there is some finite light; beyond the table's last incidence, that of the last.
+    theta_i, theta_r = np.meshgrid(np.linspace(-179, 179, 60), np.linspace(-179, 179, 61))
+    assert np.all(np.isfinite(world.light(theta_i, theta_r)))
+    assert petal.f_r(np.array([88.0]), np.array([10.0])) == pytest.approx(petal.f_r(np.array([80.0]), np.array([10.0])))

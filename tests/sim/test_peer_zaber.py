@@ -37,11 +37,13 @@ def connection(running: Running, request: pytest.FixtureRequest) -> Iterator[Con
 
 @pytest.fixture
 def stages(connection: Connection) -> list[Device]:
-    return connection.detect_devices(identify_devices=False)
+    return [connection.get_device(address) for address in (1, 2)]
 
 
-def test_the_chain_is_found(stages: list[Device]) -> None:
-    assert [device.device_address for device in stages] == [1, 2]
+def test_the_chain_is_found(connection: Connection) -> None:
+    found = connection.detect_devices(identify_devices=False)
+    assert [device.device_address for device in found] == [1, 2]
+    assert found[1].get_axis(1).get_position() == 0
 
 
 def test_home_move_and_read_back(stages: list[Device], running: Running) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import select
 from collections.abc import Callable
 from typing import Any
 
@@ -90,6 +91,22 @@ def test_clients_come_and_go_and_leave_nothing_behind(running: Running, connect:
         client.close()
     client = connect(running.url("stages"))
     assert client.ask(b"/0 1 07").split()[5] == b"WR"
+
+
+def test_a_reply_not_stayed_for_is_not_kept_for_the_next_client(running: Running, connect: Connect) -> None:
+    fd = os.open(running.pty("stages"), os.O_RDWR | os.O_NOCTTY)  # bare, for serial ports empty themselves when opened
+    os.write(fd, b"/1 0 98\n")
+    assert select.select([fd], [], [], 10)[0] == [fd]
+    os.close(fd)
+    client = connect(running.url("stages"))
+    for i in range(10):  # by then the server has seen the terminal closed
+        assert client.ask(b"/2 0 %02d" % i) == b"@02 0 %02d OK IDLE WR 0\r\n" % i
+    fd = os.open(running.pty("stages"), os.O_RDWR | os.O_NOCTTY)
+    try:
+        os.write(fd, b"/1 0 11\n")
+        assert os.read(fd, 100).startswith(b"@01 0 11 ")
+    finally:
+        os.close(fd)
 
 
 def test_a_pty_client_that_does_not_read_holds_nobody_else_up(running: Running, connect: Connect) -> None:

@@ -30,7 +30,7 @@ def test_fresnel_at_normal_brewster_and_total(n: float) -> None:
 @given(n=st.floats(1.1, 2.0), theta=st.floats(0, 1.5))
 def test_fresnel_is_the_same_from_both_sides(n: float, theta: float) -> None:
     reflectance, cos_out = kernels.fresnel(math.cos(theta), n)
-    assert math.sqrt(1 - cos_out**2) == pytest.approx(math.sin(theta) / n, abs=1e-9)
+    assert math.sqrt(1 - cos_out**2) == pytest.approx(math.sin(theta) / n, abs=1e-7)
     assert kernels.fresnel(cos_out, 1 / n)[0] == pytest.approx(reflectance, abs=1e-9)
 
 

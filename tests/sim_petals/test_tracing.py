@@ -101,7 +101,7 @@ def test_energy_is_conserved(petal: Petal) -> None:
     assert result.reflected + result.transmitted + result.absorbed + result.roulette == pytest.approx(1, abs=1e-12)
     if petal is LOSSLESS:
         assert (result.absorbed == 0).all()
-        assert (result.roulette == 0).all()
+        assert result.reflected.mean() + result.transmitted.mean() == pytest.approx(1, abs=1e-5)  # a few grazing photons play roulette
         assert result.transmitted.mean() > 0.2
     else:
         assert abs(deviations(result.roulette, 0.0)) < 5
@@ -111,7 +111,7 @@ def test_white_furnace() -> None:
     """A lossless closed petal under a uniformly bright sky is as bright as the sky, whichever way one looks."""
     petal = LOSSLESS._replace(backing=1.0)
     result = trace(petal, (0.0, 90.0), 60_000, 6)
-    assert result.reflected == pytest.approx(1, abs=1e-12)
+    assert result.reflected.mean() == pytest.approx(1, abs=1e-5)
     assert_standard_normal(deviations(result.bins.mean(axis=2), 1 / math.pi))
 
 
@@ -124,10 +124,23 @@ def test_light_and_view_can_change_places(name: str) -> None:
     assert np.abs(deviations(there, back.mean() * 1.5)).mean() > 5  # fine enough to see such a difference
 
 
-@pytest.mark.parametrize("name", ["BR", "PR", "WR"])
-def test_scored_light_agrees_with_counted_light(name: str) -> None:
+ROUGH_FLAT = Petal(radius=0.0, roughness=0.6, mesophyll=60.0)
+
+
+@pytest.mark.parametrize(
+    ("petal", "photons"),
+    [
+        (CULTIVARS["BR"], 60_000),
+        (CULTIVARS["PR"], 60_000),
+        (CULTIVARS["WR"], 60_000),
+        (ROUGH_FLAT._replace(pigment=0.3), 600_000),
+        (ROUGH_FLAT, 100_000),
+    ],
+    ids=["BR", "PR", "WR", "flat dark", "flat pale"],
+)
+def test_scored_light_agrees_with_counted_light(petal: Petal, photons: int) -> None:
     """The lobe formulas against plain counting of photons, at the grazing incidence where most facets hide each other."""
-    result = trace(CULTIVARS[name], 60.0, 60_000, 9)
+    result = trace(petal, 70.0, photons, 9)
     inner = np.abs(theta_r_nodes()) <= 70
     assert_standard_normal(deviations((result.cones - result.f_r)[:, inner], 0.0))
     assert (result.surface > 0).any()
