@@ -1,0 +1,1 @@
+"""Pictures of the flower with the measured reflectance."""

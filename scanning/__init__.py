@@ -1,0 +1,1 @@
+"""Range images of petals into meshes, and meshes into a flower."""
