@@ -35,6 +35,7 @@ def measurements_of(run: Run) -> "Measurements":
         Where the run has no good reading.
     """
     import numpy as np
+
     from fitting.measurements import Measurements
 
     groups: dict[tuple[float, float], list[Reading]] = defaultdict(list)

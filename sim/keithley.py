@@ -518,7 +518,7 @@ class Keithley6485:
                 way = -1
             else:
                 break
-            self._change_range(RANGES[-1])
+            self._change_range(RANGES[RANGES.index(full) + way])
             value = await self._convert()
         return value
 

@@ -10,8 +10,8 @@ from sim.petals.tracing import BATCHES, TRACER_VERSION, Trace, mean_and_error, t
 
 THETA_I = (0.0, 10.0, 20.0, 30.0, 40.0, 45.0, 50.0, 60.0, 70.0, 80.0)
 SEED = 20061
-# Photons per angle of incidence, for a standard error of at most 1 % where |theta_r| and theta_i are at most 70 deg. Black needs
-# most: little of its body's light comes out, and that through the thin flanks of tall domes, a few bright photons at a time.
+# Photons per angle of incidence, for a standard error of at most 1 % where |theta_r| and theta_i are at most 70 deg. Black needs most: the
+# light that leaves its body does so in few, bright photons.
 PHOTONS = {"BR": 7_000_000, "RR": 2_400_000, "PR": 2_000_000, "WR": 800_000}
 
 

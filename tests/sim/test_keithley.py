@@ -155,7 +155,7 @@ def test_queries_the_6514_client_asks(desk: Desk) -> None:
 def test_settings_are_kept(desk: Desk, tell: str, ask: str, value: float) -> None:
     desk.send(tell)
     assert desk.errors() == []
-    assert float(desk.ask(ask)) == pytest.approx(value, rel=1e-12)
+    assert float(desk.ask(ask)) == pytest.approx(value, rel=1e-12, abs=0)
     desk.send("AVER:TCON REPEAT")
     assert desk.ask("AVER:TCON?") == "REP"
 
@@ -187,7 +187,7 @@ def test_elements(desk: Desk, elements: str, fields: int) -> None:
     assert len(desk.read()) == fields
     assert desk.ask("FETC?") == desk.ask("FETC?")
     if "READ" in elements:
-        assert desk.read()[0] == pytest.approx(1e-7, rel=1e-4)  # always first, in whatever order asked for
+        assert desk.read()[0] == pytest.approx(1e-7, rel=1e-4, abs=0)  # always first, in whatever order asked for
 
 
 @pytest.mark.parametrize(("frequency", "cycles"), [(60.0, 1.0), (50.0, 1.0), (50.0, 0.1), (60.0, 60.0)])
@@ -267,13 +267,13 @@ def test_zero_correction_removes_the_offset() -> None:
 def test_quantisation_and_noise_follow_the_range(full: float) -> None:
     desk = Desk(full / 2).ready(f";:CURR:RANG {full};NPLC 1;:TRIG:COUN 500;:FORM:ELEM READ")
     readings = np.array(desk.read())
-    assert np.std(readings) == pytest.approx(5e-6 * full, rel=0.15)
+    assert np.std(readings) == pytest.approx(5e-6 * full, rel=0.15, abs=0)
     zero = desk.meter._correction
     steps = (readings + zero) / (full / 2e6)
     # Replies have seven digits: half a unit of the last one is 0.5 of a step here at most.
     assert np.max(np.abs(steps - np.round(steps))) < 0.51
     desk.send("CURR:NPLC 25")
-    assert np.std(desk.read()) == pytest.approx(1e-6 * full, rel=0.15)
+    assert np.std(desk.read()) == pytest.approx(1e-6 * full, rel=0.15, abs=0)
 
 
 def test_coarse_steps_show_on_a_wide_range() -> None:
@@ -320,7 +320,7 @@ def test_start_sequence_of_the_sheet_command_by_command(desk: Desk) -> None:
     ):  # fmt: skip
         assert desk.send(message) is None
     reading = desk.ask("READ?").split(",")[0]
-    assert float(reading.removesuffix("A")) == pytest.approx(1e-7, rel=1e-4)
+    assert float(reading.removesuffix("A")) == pytest.approx(1e-7, rel=1e-4, abs=0)
     assert desk.errors() == []
 
 
@@ -411,4 +411,4 @@ def test_no_bytes_can_upset_it(message: bytes) -> None:
     asyncio.run(desk.meter.answer(message))
     desk.send("*CLS")
     assert desk.errors() == []
-    assert desk.ready().read()[0] == pytest.approx(1e-7, rel=1e-4)
+    assert desk.ready().read()[0] == pytest.approx(1e-7, rel=1e-4, abs=0)

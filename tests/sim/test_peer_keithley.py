@@ -94,6 +94,6 @@ def test_it_reads_the_light_of_a_white_specimen() -> None:
         meter.zero_check = False
         current, time = meter.read_measurements()
         lamp = world.bench.lamp.level(time)
-        assert float(current) == pytest.approx(1e-6 * lamp, rel=5e-5)
+        assert float(current) == pytest.approx(1e-6 * lamp, rel=5e-5, abs=0)
         assert lamp == pytest.approx(1.0, abs=2e-3)
         meter._file._conn.close()

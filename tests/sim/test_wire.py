@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import select
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -109,15 +110,28 @@ def test_a_reply_not_stayed_for_is_not_kept_for_the_next_client(running: Running
         os.close(fd)
 
 
-def test_a_pty_client_that_does_not_read_holds_nobody_else_up(running: Running, connect: Connect) -> None:
+def test_a_pty_client_that_writes_on_and_does_not_read_holds_nobody_else_up(running: Running, connect: Connect) -> None:
     with open_pty(running.pty("meter")) as port:
-        port.write(b"*IDN?\n" * 20_000)  # far more replies than the terminal holds, and more questions than the meter keeps
-        other = connect(running.url("meter"))
-        assert other.ask(b"*OPC?") == b"1\n"
-        assert other.ask(b"SYST:ERR?").startswith(b"-363,")
+        heard = threading.Event()
+
+        def flood() -> None:
+            while not heard.is_set():
+                port.write(b"*IDN?\n" * 5000)  # far more replies than the terminal holds, and more questions than the meter keeps
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            other = connect(running.url("meter"))
+            assert other.ask(b"*OPC?") == b"1\n"
+            while not other.ask(b"SYST:ERR?").startswith(b"-363,"):
+                pass
+        finally:
+            heard.set()
+            thread.join()
     with open_pty(running.pty("meter")) as port:
-        # Opened again before the meter could notice, the line still carries what the meter had to say, as a real one would.
-        line = ask(port, b"*OPC?")
+        # Opened again before the meter could notice, the line still carries what the meter has to say, as a real one would:
+        # ^X makes it drop the questions it has not come to.
+        line = ask(port, b"\x18*OPC?")
         while line != b"1\n":
             assert line
             line = port.readline()
