@@ -204,8 +204,10 @@ def test_rebuilding_is_repeatable_and_reports_progress(tmp_path: Path, capsys: p
 @pytest.mark.slow
 @each
 def test_a_row_traced_anew_agrees_with_the_table(table: PetalTable) -> None:
-    mean, error = mean_and_error(f_r_batches(trace_node(table.name, 45.0, 40_000, seed=1), 45.0))
+    # A twentieth of the photons: with much fewer, the rare bright photons of BR leave the batches far from normal.
+    mean, error = mean_and_error(f_r_batches(trace_node(table.name, 45.0, table.photons // 20, seed=1), 45.0))
     row = table.theta_i.tolist().index(45)
     z = (mean - table.f_r_nodes[row]) / np.hypot(error, table.standard_error[row])
     assert np.abs(z).max() < 5
-    assert np.mean(z**2) < 1 + 5 * math.sqrt(2 / z.size)
+    # A photon is seen from several neighbouring views, so that about a quarter of the 35 are independent.
+    assert np.mean(z**2) < 1 + 5 * math.sqrt(2 / (z.size / 4))
