@@ -98,7 +98,7 @@ class DeviceModel:
 
         Raises
         ------
-        PortClosed
+        TransportTimeout
             The port is absent or busy.
         InvalidSetting
             The model has no such line setting, or it cannot have that value.

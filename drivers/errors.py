@@ -84,11 +84,11 @@ class DeviceError(Exception):
 
 
 class TransportTimeout(DeviceError):
-    """No complete reply came in time. For a reply that came but is wrong, see `UnexpectedReply`."""
+    """Nobody answers: the port is absent or busy, or no complete reply came in time. For a wrong reply, see `UnexpectedReply`."""
 
 
 class PortClosed(DeviceError):
-    """The port could not be opened, was unplugged, or has been closed by us."""
+    """A port that was open is gone: unplugged, hung up at the other end, or closed by us."""
 
 
 class BadChecksum(DeviceError):

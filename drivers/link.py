@@ -129,7 +129,7 @@ class Link:
 
         Raises
         ------
-        PortClosed
+        TransportTimeout
             The port is absent, busy or refuses the connection.
         InvalidSetting
             The URL or a setting means nothing to pyserial.
@@ -145,7 +145,7 @@ class Link:
             port = serial.serial_for_url(url, timeout=0, write_timeout=timeout_s, exclusive=True, **settings)
         except OSError as error:
             hint = "check that it is plugged in, powered, and not in use by another program"
-            raise PortClosed(str(error), device=device, port=url, attempt=attempt, hint=hint) from error
+            raise TransportTimeout(str(error), device=device, port=url, attempt=attempt, hint=hint) from error
         except Exception as error:  # pyserial lets ValueError, TypeError and termios.error through
             raise InvalidSetting(f"{type(error).__name__}: {error}", device=device, port=url, attempt=attempt) from error
         if url.startswith("socket://"):

@@ -42,6 +42,9 @@ Examples:
 )
 @click.option("--where", "wheres", multiple=True, metavar="COLUMN=VALUE", help="FILE: use only these rows.")
 @click.option(
+    "--theta-i", type=click.FloatRange(0, 90, max_open=True), metavar="DEG", help="FILE: the incidence, where no column holds it."
+)
+@click.option(
     "--theta-r-positive",
     type=click.Choice(["light", "forward"]),
     default="light",
@@ -65,6 +68,7 @@ def command(
     aspect: float,
     columns: tuple[str, ...],
     wheres: tuple[str, ...],
+    theta_i: float | None,
     theta_r_positive: Literal["light", "forward"],
     quantity: Literal["auto", "intensity", "reflectance-factor", "brdf"],
     as_json: bool,
@@ -79,15 +83,15 @@ def command(
         path = Path(run_or_file)
         measurements = read_csv(
             path,
-            columns=_pairs(columns, "--column"),
+            columns=_pairs(columns, "--column") | ({} if theta_i is None else {"theta_i": theta_i}),
             where=_pairs(wheres, "--where"),
             theta_r_positive=theta_r_positive,
             quantity=None if quantity == "auto" else quantity,
         )
         stored = new_fit(_label(path), False, provenance_of_file(path), fit_mixture(measurements, aspect=aspect, weights=weights))
     else:
-        if columns or wheres or theta_r_positive != "light" or quantity != "auto":
-            raise ConfigError("--column, --where, --theta-r-positive and --quantity are for tables (FILE.csv), not for runs")
+        if columns or wheres or theta_i is not None or theta_r_positive != "light" or quantity != "auto":
+            raise ConfigError("--column, --where, --theta-i, --theta-r-positive and --quantity are for tables (FILE.csv), not for runs")
         run = _find(settings, run_or_file, cultivar)
         stored = fit_run(run, weights, aspect)
     path = store_fit(settings.workspace.fits, stored)

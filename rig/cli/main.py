@@ -93,7 +93,9 @@ def main(arguments: list[str] | None = None) -> None:
     except Exception as exc:
         if not _expected(exc):
             raise
-        _fail(str(exc), 1, exc, arguments)
+        # A device's trouble is known by its name; ours are plain sentences.
+        name = "" if isinstance(exc, RigError) else f"{type(exc).__name__}: "
+        _fail(f"{name}{exc}", 1, exc, arguments)
 
 
 def _expected(exc: Exception) -> bool:

@@ -11,7 +11,7 @@ import pytest
 
 from drivers import catalogue
 from drivers.catalogue import BUILT_IN, DeviceModel, Option
-from drivers.errors import CatalogueError, InvalidSetting, PortClosed, UnknownModel
+from drivers.errors import CatalogueError, InvalidSetting, TransportTimeout, UnknownModel
 from drivers.sensors.keithley6485 import Keithley6485
 from drivers.stages.zaber import ZaberAxis
 
@@ -159,7 +159,7 @@ def test_opening_a_meter_over_its_own_link(script: Any, make_peer: Any) -> None:
 
 
 def test_opening_an_absent_port() -> None:
-    with pytest.raises(PortClosed, match="keithley-6485 on /dev/no-such-port"):
+    with pytest.raises(TransportTimeout, match="keithley-6485 on /dev/no-such-port"):
         catalogue.lookup("keithley-6485").open_link("/dev/no-such-port")
 
 

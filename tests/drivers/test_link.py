@@ -124,14 +124,14 @@ def test_a_refusal_is_never_asked_again(plug: Any, script: Any) -> None:
 
 
 def test_absent_serial_port_names_port_and_device() -> None:
-    with pytest.raises(PortClosed, match=r"theta_i on /dev/no-such-port: opening the port"):
+    with pytest.raises(TransportTimeout, match=r"theta_i on /dev/no-such-port: opening the port"):
         Link.open("/dev/no-such-port", device="theta_i")
 
 
 def test_absent_tcp_port_names_port_and_device() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    with pytest.raises(PortClosed, match=f"theta_i on socket://127.0.0.1:{port}"):
+    with pytest.raises(TransportTimeout, match=f"theta_i on socket://127.0.0.1:{port}"):
         Link.open(f"socket://127.0.0.1:{port}", device="theta_i")
 
 
@@ -176,7 +176,7 @@ def test_closed_by_another_thread_while_waiting(plug: Any, script: Any) -> None:
 
 def test_one_port_one_link(plug: Any) -> None:
     link = plug()
-    with pytest.raises(PortClosed):
+    with pytest.raises(TransportTimeout):
         Link.open(link.url, device="intruder")
 
 
