@@ -5,7 +5,7 @@ What each owes the engine: https://blueskyproject.io/bluesky/main/hardware.html
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from drivers.errors import DeviceFault, MoveTimeout, NotHomed, UnexpectedReply
@@ -30,7 +30,33 @@ def _reading(**values: Any) -> Reading:
     return {key: {"value": value, "timestamp": now} for key, value in values.items()}
 
 
-class Axis:
+class Configured:
+    """A device that says, with every run, who it is and how it is set."""
+
+    parent = None
+    name: str
+    kind: str
+
+    def _configuration(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def read_configuration(self) -> Reading:
+        """Return the instrument's identity and settings."""
+        return _reading(**{f"{self.name}_{key}": value for key, value in self._configuration().items()})
+
+    def describe_configuration(self) -> dict[str, dict[str, Any]]:
+        """Return type and source of what `read_configuration` gives."""
+        return {
+            f"{self.name}_{key}": {
+                "source": f"{self.kind}:{self.name}",
+                "dtype": "string" if isinstance(value, str) else "number",
+                "shape": [],
+            }
+            for key, value in self._configuration().items()
+        }
+
+
+class Axis(Configured):
     """A positioner in degrees of theta: Movable, Locatable, Stoppable, Readable and Checkable.
 
     Parameters
@@ -52,7 +78,7 @@ class Axis:
         `check(axis name, theta_deg)` raises InterlockError where the axis may not go.
     """
 
-    parent = None
+    kind = "axis"
 
     def __init__(
         self,
@@ -165,20 +191,9 @@ class Axis:
         key = {"source": f"axis:{self.name}", "dtype": "number", "shape": [], "units": "degree"}
         return {self.angle: dict(key), f"{self.angle}_setpoint": dict(key)}
 
-    def read_configuration(self) -> Reading:
-        """Return the stage's identity and how its angle is counted."""
-        return _reading(**{f"{self.name}_{key}": value for key, value in self._configuration().items()})
-
-    def describe_configuration(self) -> dict[str, dict[str, Any]]:
-        """Return type and source of what `read_configuration` gives."""
-        return _describe_values(f"axis:{self.name}", self.name, self._configuration())
-
     def _configuration(self) -> dict[str, Any]:
         return {
-            "vendor": self._identity.vendor,
-            "model": self._identity.model,
-            "serial_number": self._identity.serial_number,
-            "firmware": self._identity.firmware,
+            **vars(self._identity),
             "sign": self.map.sign,
             "offset_deg": self.map.offset_deg,
             "speed_deg_s": self._profile.speed_deg_s,
@@ -288,13 +303,13 @@ class Homing:
         return {}
 
 
-class LightMeter:
+class LightMeter(Configured):
     """A light sensor: Triggerable and Readable.
 
     A reading out of the meter's range is kept as read, marked by `<name>_good = 0`, and never used as good.
     """
 
-    parent = None
+    kind = "sensor"
 
     def __init__(self, name: str, driver: LightSensor, bus: BusWorker) -> None:
         self.name = name
@@ -339,26 +354,8 @@ class LightMeter:
             f"{self.name}_good": {"source": source, "dtype": "integer", "shape": []},
         }
 
-    def read_configuration(self) -> Reading:
-        """Return the meter's identity and settings."""
-        return _reading(**{f"{self.name}_{key}": value for key, value in self._configuration().items()})
-
-    def describe_configuration(self) -> dict[str, dict[str, Any]]:
-        """Return type and source of what `read_configuration` gives."""
-        return _describe_values(f"sensor:{self.name}", self.name, self._configuration())
-
     def _configuration(self) -> dict[str, Any]:
         return {
-            "vendor": self._identity.vendor,
-            "model": self._identity.model,
-            "serial_number": self._identity.serial_number,
-            "firmware": self._identity.firmware,
+            **vars(self._identity),
             "integration_s": self.driver.integration_s,
         }
-
-
-def _describe_values(source: str, prefix: str, values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    return {
-        f"{prefix}_{key}": {"source": source, "dtype": "string" if isinstance(value, str) else "number", "shape": []}
-        for key, value in values.items()
-    }
