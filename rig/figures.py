@@ -66,18 +66,17 @@ def draw_all(fits: Mapping[str, "StoredFit"], folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name, (draw, size) in drawers.items():
+        paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
         # Figure 6 is the model alone: nothing in it was measured.
-        with _figure(size, simulated=simulated and name != "figure-6") as figure:
+        with saved_figure(size, paths, simulated=simulated and name != "figure-6") as figure:
             draw(figure)
-            for ending in ("png", "svg"):
-                path = folder / f"{name}.{ending}"
-                figure.savefig(path, dpi=160, metadata={"Date": None} if ending == "svg" else None)
-                written.append(path)
+        written += paths
     return written
 
 
 @contextmanager
-def _figure(size: tuple[float, float], *, simulated: bool) -> Iterator["Figure"]:
+def saved_figure(size: tuple[float, float], paths: Sequence[Path], *, simulated: bool) -> Iterator["Figure"]:
+    """Yield an empty figure of `size` inches, marked where what it shows is simulated, and save it to `paths` afterwards."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -86,6 +85,8 @@ def _figure(size: tuple[float, float], *, simulated: bool) -> Iterator["Figure"]
         if simulated:
             figure.text(0.985, 0.975, "SIMULATED", ha="right", va="top", fontsize=13, fontweight="bold", color="#B00000")
         yield figure
+        for path in paths:
+            figure.savefig(path, dpi=160, metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def _polar_axes(figure: "Figure", scale: float, theta_i: float, unit: str) -> Any:

@@ -1,6 +1,7 @@
 """A sweep on the screen: a live table above a bar with the time left. All of it on stderr."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -84,3 +85,13 @@ class SweepScreen:
         if goes_on:
             self._progress.start()
         return goes_on
+
+
+@contextmanager
+def steps(what: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Show a bar with the time left on stderr; yields `progress(done, total, name)`."""
+    console = Console(stderr=True, highlight=False)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what)
+        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=f"{what} {name}".rstrip())

@@ -7,15 +7,27 @@ import click
 from rig.cli.settings import Settings
 from rig.cultivars import TABLE_1
 from rig.fits import latest_fit
+from rig.pictures import is_simulated
 
 
-@click.command(epilog="\b\nExamples:\n  rig figures\n  rig figures --out paper/")
+@click.command(epilog="\b\nExamples:\n  rig figures\n  rig figures --flower rose --out paper/")
+@click.option("--flower", metavar="DIR", type=click.Path(path_type=Path), help="Draw figures 11, 13 and 14 too, of this assembled flower.")
 @click.option("--out", metavar="DIR", help="Where to draw [default: figures/ in the workspace].")
 @click.pass_obj
-def command(settings: Settings, out: str | None) -> None:
+def command(settings: Settings, flower: Path | None, out: str | None) -> None:
     """Draw the paper's figures 1, 2, 6, 7, 8 and 9 from the newest fit of each cultivar, as PNG and SVG."""
     from rig.figures import draw_all
 
     fits = {cultivar.abbreviation: latest_fit(settings.workspace.fits, cultivar.abbreviation) for cultivar in TABLE_1}
-    for path in draw_all(fits, Path(out) if out else settings.workspace.figures):
+    folder = Path(out) if out else settings.workspace.figures
+    for path in draw_all(fits, folder):
         click.echo(path)
+    if flower is None:
+        return
+    from rig.flowerfigures import draw_flower
+
+    simulated = is_simulated(flower) or any(fit.simulated for fit in fits.values())
+    written, contrasts = draw_flower(flower, fits, folder, simulated=simulated)
+    for path in written:
+        click.echo(path)
+    click.echo(contrasts, err=True)

@@ -17,6 +17,9 @@ COMMANDS = {
     "cultivars": ("rig.cli.cultivars", "List the known cultivars, or add one."),
     "fit": ("rig.cli.fit", "Fit the paper's reflection model to a run or a table."),
     "model": ("rig.cli.model", "Evaluate the reflection model itself."),
+    "scan": ("rig.cli.scan", "Turn range images of petals into meshes."),
+    "flower": ("rig.cli.flower", "Put scanned petals together into a flower."),
+    "render": ("rig.cli.render", "Ray-cast a flower with a fitted reflectance."),
     "figures": ("rig.cli.figures", "Draw the paper's figures from the newest fits."),
     "demo": ("rig.cli.demo", "The whole chain on the simulated bench."),
 }
@@ -91,20 +94,28 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stderr.close()
         sys.exit(1)
     except Exception as exc:
-        if not _expected(exc):
+        name = _name(exc)
+        if name is None:
             raise
-        # A device's trouble is known by its name; ours are plain sentences.
-        name = "" if isinstance(exc, RigError) else f"{type(exc).__name__}: "
         _fail(f"{name}{exc}", 1, exc, arguments)
 
 
-def _expected(exc: Exception) -> bool:
-    """Tell errors that we name from those that are our own faults, without importing rooms that were not used."""
-    roots: list[type] = [RigError]
-    for module, name in (("drivers.errors", "DeviceError"), ("fitting.errors", "FitError")):
-        if module in sys.modules:
-            roots.append(getattr(sys.modules[module], name))
-    return isinstance(exc, tuple(roots))
+def _name(exc: Exception) -> str | None:
+    """Return what to call an error: '' for our own, which are plain sentences; None for one that should not be.
+
+    Rooms that were not used are not imported.
+    """
+    if isinstance(exc, RigError):
+        return ""
+    for module, root in (
+        ("drivers.errors", "DeviceError"),
+        ("fitting.errors", "FitError"),
+        ("scanning.errors", "ScanError"),
+        ("render.errors", "RenderError"),
+    ):
+        if module in sys.modules and isinstance(exc, getattr(sys.modules[module], root)):
+            return f"{type(exc).__name__ if root == 'DeviceError' else root}: "  # a device's trouble is known by its own name
+    return None
 
 
 def _fail(message: str, code: int, exc: Exception | None = None, arguments: list[str] | None = None) -> None:

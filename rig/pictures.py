@@ -1,0 +1,86 @@
+"""The flower with a fitted reflectance: from flower folder and fit to a picture."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rig.errors import RunError
+from rig.fits import StoredFit, latest_fit, list_fits, read_fit
+
+if TYPE_CHECKING:
+    from fitting.table import Reflectance, ReflectanceTable
+    from render.camera import Camera
+    from render.light import Light
+    from render.raycast import Picture, Raycaster
+
+COLOURS = {"BR": (0.42, 0.02, 0.06), "RR": (0.85, 0.04, 0.06), "PR": (0.98, 0.55, 0.66), "WR": (0.98, 0.97, 0.90)}
+"""Hues to show the cultivars in: the model has no colour yet, so these are for the eye only."""
+
+ABOVE = (0.55, -0.75, 0.75)
+"""From where the flower is seen by default: from the front, a good way above its horizon."""
+
+
+def find_fit(fits: Path, wanted: str) -> StoredFit:
+    """Return the fit that `wanted` names: a cultivar's newest, a stored fit's name, or a file."""
+    if Path(wanted).is_file():
+        return read_fit(Path(wanted))
+    stored = {fit.id: fit for fit in list_fits(fits)}
+    if wanted in stored:
+        return stored[wanted]
+    if any(fit.label == wanted for fit in stored.values()):
+        return latest_fit(fits, wanted)
+    raise RunError(
+        f"no fit {wanted!r} in {fits}; give a cultivar that has one, a fit's name or its file (`rig fit --cultivar RR` makes one)"
+    )
+
+
+def is_simulated(flower: Path) -> bool:
+    """Tell whether the petals of `flower` are virtual."""
+    try:
+        return bool(tomllib.loads((flower / "flower.toml").read_text(encoding="utf-8")).get("simulated", False))
+    except (OSError, tomllib.TOMLDecodeError) as exc:
+        raise RunError(f"{flower / 'flower.toml'}: cannot be read: {exc}; a flower's folder was expected") from exc
+
+
+def marked(image: Any) -> Any:
+    """Return the image with SIMULATED written into its corner."""
+    import cv2
+
+    size = image.shape[1] / 800
+    return cv2.putText(image.copy(), "SIMULATED", (round(14 * size), round(34 * size)), cv2.FONT_HERSHEY_SIMPLEX, size, (255, 96, 96), 2)
+
+
+@dataclass
+class Shades:
+    """Reflectance tables, one for each cell shape, computed when first asked for."""
+
+    tables: "dict[tuple[float, float, float], ReflectanceTable]"
+
+    def of(self, fit: StoredFit) -> "Reflectance":
+        """Return the intensity of eq. (8) for any direction, as `fit` has it."""
+        from fitting.table import tabulate
+
+        key = (fit.fit.aspect, fit.fit.n_us, fit.fit.n_ss)
+        if key not in self.tables:
+            self.tables[key] = tabulate(aspect=key[0], n_us=key[1], n_ss=key[2])
+        return self.tables[key].mixed(fit.fit.x)
+
+
+def frame(raycaster: "Raycaster", width: int, height: int, towards: tuple[float, float, float] = ABOVE) -> "Camera":
+    """Return a camera that has the whole flower in view."""
+    from render.camera import Camera
+
+    return Camera.framing(raycaster.scene.vertices, towards, width=width, height=height)
+
+
+def take(raycaster: "Raycaster", camera: "Camera", shade: "Reflectance", *, light: "Light | None" = None, samples: int = 4) -> "Picture":
+    """Take a picture, lit as the paper's are unless `light` says otherwise."""
+    return raycaster.picture(camera, shade, light=light, samples=samples)
+
+
+def show(picture: "Picture", label: str) -> Any:
+    """Return the picture as 8-bit sRGB in the cultivar's hue, exposed for itself."""
+    from render.images import develop, exposure
+
+    return develop(picture, exposure(picture), colour=COLOURS.get(label, (1.0, 1.0, 1.0)))

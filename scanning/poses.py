@@ -1,0 +1,127 @@
+"""Where a petal stands in its flower, as the six coordinates that are measured or assumed.
+
+A petal's pose is written in generalised coordinates q = (azimuth, radius, height, tilt, heading, roll): the base point's cylindrical
+coordinates, the angle between the stem and the base-tip line, the turn of the petal's plane of symmetry away from its base's azimuth, and
+the turn about the base-tip line. At heading 0 and roll 0 the petal's y and z axes lie in the meridian plane of its base, its inner face to
+the stem. Each measurement is then one coordinate, or (the stem angle) one function of them.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+AZIMUTH, RADIUS, HEIGHT, TILT, HEADING, ROLL = range(6)
+ANGLES = (AZIMUTH, TILT, HEADING, ROLL)
+
+
+def _axes(q: Array) -> tuple[Array, Array, Array, Array]:
+    """Return base points, and the tangential (x = -tangential), base-tip and inner-face directions before roll, each (K, 3)."""
+    azimuth, radius, height, tilt, heading, _ = q.T
+    zero = np.zeros_like(azimuth)
+    base = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], -1)
+    course = azimuth + heading
+    outward = np.stack([np.cos(course), np.sin(course), zero], -1)
+    tangent = np.stack([-np.sin(course), np.cos(course), zero], -1)
+    up = np.array([0.0, 0.0, 1.0])
+    midrib = np.cos(tilt)[:, None] * up + np.sin(tilt)[:, None] * outward
+    inner = np.sin(tilt)[:, None] * up - np.cos(tilt)[:, None] * outward
+    return base, tangent, midrib, inner
+
+
+def petal_poses(q: Array) -> Array:
+    """Return the poses of petals from their coordinates.
+
+    Parameters
+    ----------
+    q : (K, 6) azimuth, radius, height, tilt, heading, roll; radians and mm.
+
+    Returns
+    -------
+    (K, 4, 4) T_flower_petal.
+    """
+    base, tangent, midrib, inner = _axes(q)
+    cos, sin = np.cos(q[:, ROLL])[:, None], np.sin(q[:, ROLL])[:, None]
+    poses = np.zeros((len(q), 4, 4))
+    poses[:, :3, 0] = -cos * tangent - sin * inner
+    poses[:, :3, 1] = midrib
+    poses[:, :3, 2] = cos * inner - sin * tangent
+    poses[:, :3, 3] = base
+    poses[:, 3, 3] = 1.0
+    return poses
+
+
+def twists(q: Array) -> tuple[Array, Array]:
+    """Return how a petal moves when one of its coordinates does.
+
+    A point p of petal k moves by omega[k, c] x p + v[k, c] per unit of coordinate c.
+
+    Parameters
+    ----------
+    q : (K, 6) coordinates; radians and mm.
+
+    Returns
+    -------
+    omega, v : (K, 6, 3) angular velocity, and velocity at the origin.
+    """
+    base, tangent, midrib, _ = _axes(q)
+    up = np.array([0.0, 0.0, 1.0])
+    omega, v = np.zeros((len(q), 6, 3)), np.zeros((len(q), 6, 3))
+    omega[:, AZIMUTH] = up
+    v[:, RADIUS] = np.stack([np.cos(q[:, AZIMUTH]), np.sin(q[:, AZIMUTH]), np.zeros(len(q))], -1)
+    v[:, HEIGHT] = up
+    for coordinate, axis in ((TILT, tangent), (HEADING, up), (ROLL, midrib)):
+        omega[:, coordinate] = axis
+        v[:, coordinate] = -np.cross(np.broadcast_to(axis, base.shape), base)
+    return omega, v
+
+
+def stem_angles(q: Array, inflection: Array) -> Array:
+    """Return the angles between the stem and the midribs' directions at their inflections.
+
+    Parameters
+    ----------
+    q : (K, 6) coordinates; radians and mm.
+    inflection : (K, 3) unit directions in the petals' frames.
+
+    Returns
+    -------
+    (K,) radians, 0 to pi.
+    """
+    direction = np.einsum("kij,kj->ki", petal_poses(q)[:, :3, :3], inflection)
+    return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
+
+
+def measured_coordinates(azimuth: Array, radius: Array, height: Array, stem_angle: Array, inflection: Array) -> Array:
+    """Return the coordinates that have the measured values, heading and roll 0.
+
+    Parameters
+    ----------
+    azimuth, stem_angle : (K,) degrees.
+    radius, height : (K,) of the base points, mm.
+    inflection : (K, 3) unit directions of the midribs at their inflections, in the petals' frames.
+
+    Returns
+    -------
+    (K, 6) coordinates; radians and mm. Where an inflection's direction leaves the petal's y-z plane so far that no tilt has the
+    measured stem angle, the nearest one.
+    """
+    lean = np.arctan2(-inflection[:, 2], inflection[:, 1])
+    in_plane = np.hypot(inflection[:, 1], inflection[:, 2])
+    cosine = np.cos(np.radians(stem_angle)) / np.maximum(in_plane, 1e-9)
+    tilt = np.arccos(np.clip(cosine, -1.0, 1.0)) - lean
+    zero = np.zeros_like(tilt)
+    return np.stack([np.radians(azimuth), radius, height, tilt, zero, zero], -1)
+
+
+def moved(poses: Array, points: Array) -> Array:
+    """Apply one pose (4, 4) to points (N, 3)."""
+    return points @ poses[:3, :3].T + poses[:3, 3]
+
+
+def inverse(pose: Array) -> Array:
+    """Return the inverse of a rigid pose (4, 4)."""
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return out

@@ -1,0 +1,75 @@
+"""From range images of petals to a picture of the flower, by the commands."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import ROOT, rig_environment
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def rose(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A virtual rose of five petals, scanned."""
+    folder = tmp_path_factory.mktemp("rose")
+    command = [sys.executable, "-m", "sim.rose", "--petals", "5", "--seed", "2", "--out", str(folder)]
+    subprocess.run(command, check=True, cwd=ROOT, capture_output=True, env=rig_environment())
+    return folder
+
+
+def test_from_scans_to_a_picture(rig, rose: Path, tmp_path: Path) -> None:
+    rig("flower", "new", "flower")
+    assert "# [petals.P01]" in (tmp_path / "flower" / "placement.toml").read_text()
+    scans = [str(path) for path in sorted(rose.glob("*.abs"))]
+    quality = json.loads(rig("scan", "import", *scans, "--flower", "flower", "--simulated", "--json").stdout)
+    assert list(quality) == [f"P0{n}" for n in range(1, 6)]
+    assert all(9000 <= petal["points"] <= 13_000 for petal in quality.values())
+
+    # Without a placement every petal lacks one; with the measured one nothing is wrong.
+    problems = json.loads(rig("flower", "check", "flower", "--json", check=1).stdout)
+    assert len(problems) >= 5
+    text = (rose / "placement.toml").read_text()
+    (tmp_path / "flower" / "placement.toml").write_text(text.replace('petal = "P02"', 'petal = "P09"'))
+    lines = rig("flower", "check", "flower", check=1).stdout.splitlines()
+    assert any("P09" in line and "placement.toml:" in line for line in lines)
+    (tmp_path / "flower" / "placement.toml").write_text(text)
+    assert rig("flower", "check", "flower").stdout == ""
+
+    assembled = json.loads(rig("flower", "assemble", "flower", "--json", timeout=120).stdout)
+    assert assembled["state"] == "free"
+    truth = json.loads((rose / "truth.json").read_text())["petals"]
+    for name, petal in assembled["petals"].items():
+        moved = np.array(petal["T_flower_scan"]) @ np.linalg.inv(truth[name]["T_flower_scan"])
+        turn = np.degrees(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1, 1)))
+        assert turn < 15  # angles were measured to 3 deg, and roll not at all
+
+    (tmp_path / "t.csv").write_text("theta_i,theta_r,value\n" + "".join(f"45,{t},{20 + 10 * (t > 0)}\n" for t in range(-60, 61, 20)))
+    fit = json.loads(rig("fit", "t.csv", "--json").stdout)["id"]
+    rig("render", "flower", "--fit", fit, "--size", "120x100", "--samples", "1", "--out", "p.png", timeout=120)
+    import cv2
+
+    picture = cv2.imread(str(tmp_path / "p.png"))
+    assert picture.shape == (100, 120, 3)
+    assert (picture.sum(axis=2) > 60).mean() > 0.1
+    assert (tmp_path / "p.exr").stat().st_size > 10_000
+
+
+def test_a_scan_cut_off_is_named_with_its_line(rig, rose: Path, tmp_path: Path) -> None:
+    whole = (rose / "P01.abs").read_text()
+    (tmp_path / "P01.abs").write_text(whole[: len(whole) // 2])
+    assert re.search(r"ScanError: P01\.abs, line \d", rig("scan", "import", "P01.abs", "--flower", "f", check=1).stderr)
+
+
+def test_two_views_are_brought_together(rig, shared_data: Path, tmp_path: Path) -> None:
+    bunny = shared_data / "range" / "bunny"
+    done = rig("scan", "register", str(bunny / "bun000.ply"), str(bunny / "bun045.ply"), "--unit", "m", "--json", "--out", "both.ply")
+    (found,) = json.loads(done.stdout).values()
+    # bun.conf, in mm: the published place of bun045 in the frame of bun000.
+    assert np.array(found["T_target_source"])[:3, 3] == pytest.approx([-52.0211, -0.383981, -10.9223], abs=0.3)
+    assert (tmp_path / "both.ply").exists()
