@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -188,32 +187,6 @@ def test_a_visitor_chooses_turns_sees_the_collision_and_saves(browser: Browser, 
     assert told == f"Saved 3 petals, of them moved: P03 -> save {number}.\nCollide: P02, P03."
     np.testing.assert_allclose(watched.saved[-1]["P03"], petals.pose("P03", 45.1, 140.0), atol=1e-9)
     np.testing.assert_array_equal(watched.saved[-1]["P01"], petals.petals["P01"][2])
-
-
-def test_dragging_the_handle_moves_the_petal_along_the_arrow(browser: Browser, watched: Watched) -> None:
-    page, petals = watched.page, watched.petals
-    before = page.poses["P01"]
-    base = before[:3, :3] @ petals.bases["P01"] + before[:3, 3]
-    axis = _longest_arrow(page, browser, base, before)
-    direction = before[:3, axis]
-    scale = page._handle.scale
-    start, end = pixels(page, browser, base + np.array([[0.95], [1.35]]) * scale * direction)
-    moved = threading.Event()
-    page._handle.on_update(lambda event: moved.set() if event.phase == "end" else None)
-    browser.drag(*(tuple(start + f * (end - start)) for f in np.linspace(0, 1, 6)))
-    assert moved.wait(PATIENCE_S)
-    T = page.poses["P01"]
-    shift = T[:3, 3] - before[:3, 3]
-    assert shift @ direction == pytest.approx(0.4 * scale, rel=0.2)
-    np.testing.assert_allclose(shift, (shift @ direction) * direction, atol=1e-4)
-    np.testing.assert_allclose(T[:3, :3], before[:3, :3], atol=1e-6)
-    assert page.unsaved == ["P01"]
-    browser.wait_until(f"{STATUS}.includes('Not saved yet: P01.')")
-
-
-def _longest_arrow(page: Page, browser: Browser, base: Matrix, T: Matrix) -> int:
-    ends = pixels(page, browser, np.concatenate([base[None], base + page._handle.scale * T[:3, :3].T]))
-    return int(np.argmax(np.linalg.norm(ends[1:] - ends[0], axis=1)))
 
 
 def test_clicking_on_a_petal_selects_it(browser: Browser, watched: Watched) -> None:
