@@ -1,9 +1,10 @@
 """Put the petals of a flower together: eq. (14), x' = T_i x + alpha_i, all petals at once.
 
-The poses are the most probable ones given the measurements (Gaussian, with the stated standard uncertainties) under the condition that no
-two petals pass through each other and that each lies on the stated side of its neighbours. Solved by Gauss-Newton steps on the petals'
-coordinates (scanning.poses) with a one-sided spring on every gap narrower than a margin, its weight raised in stages until nothing
-intersects. A step that does not lower the cost is taken back and shortened: without that the sets of springs that act chase each other.
+The poses are the most probable ones given the measurements (Gaussian, with the stated standard uncertainties) and what is assumed of
+flowers (scanning.terms), under the condition that no two petals pass through each other and that each lies on the stated side of its
+neighbours. Solved by Gauss-Newton steps on the petals' coordinates (scanning.poses) with a one-sided spring on every gap narrower than a
+margin, its weight raised in stages until nothing intersects. A step that does not lower the cost is taken back and shortened: without that
+the sets of springs that act chase each other.
 """
 
 import time
@@ -15,19 +16,19 @@ import numpy as np
 from scanning.contact import REACH, Gaps, Sheet, clearance, crossings, gaps, samples
 from scanning.errors import ScanError
 from scanning.placement import Placement
-from scanning.poses import (
-    ANGLES,
-    AZIMUTH,
-    HEADING,
-    HEIGHT,
-    RADIUS,
-    ROLL,
-    Array,
-    inverse,
-    measured_coordinates,
-    petal_poses,
-    stem_angles,
-    twists,
+from scanning.poses import ANGLES, AZIMUTH, RADIUS, Array, inverse, petal_poses, stem_angles
+from scanning.terms import (
+    ASSUMED,
+    MEASUREMENTS,
+    Habit,
+    Measured,
+    Terms,
+    apart_and_nestled,
+    inner_nearer,
+    measured,
+    on_receptacle,
+    slopes,
+    step_down,
 )
 
 MARGIN = 0.25  # mm between sheets that touch: a petal's thickness
@@ -36,8 +37,6 @@ CAPS = np.where(np.isin(np.arange(6), ANGLES), 0.06, 1.5)  # rad, mm in one step
 STAGES = (3.0, 10.0, 30.0, 100.0, 100.0, 200.0, 400.0)  # 1/mm, weight of a gap against 1/sd of a measurement
 DEEPEST, SHALLOWER = 0.8, 0.75  # mm, and per step: once the petals are nearly apart, what seems deeper is the far side of a fold
 CONFLICT = 3.0  # sd
-MEASUREMENTS = {"azimuth": "deg", "base_radius": "mm", "base_height": "mm", "stem_angle": "deg", "heading": "deg", "roll": "deg"}
-_ORDER = (AZIMUTH, RADIUS, HEIGHT, None, HEADING, ROLL)  # the coordinate behind each measurement; None: a function of several
 
 Progress = Callable[[str, float], None]
 
@@ -59,10 +58,11 @@ class Assembly:
     clearance : least distance between two petals, mm (0 where they intersect, inf for a single petal).
     stem_angle, azimuth : (K,) degrees, as assembled.
     residuals : (K, 6) assembled less measured in standard uncertainties: azimuth, base_radius, base_height, stem_angle, and the two
-        assumed to be 0: heading and roll.
+        assumed to be 0: base_side and roll.
     pairs : the pairs (inner, outer) that were kept, stated ones and those inferred from the measured poses.
     intersecting : pairs of petals that pass through each other.
     conflicts : what cannot be true together, in words.
+    habit : what was assumed.
     seed, seconds : of the run.
     """
 
@@ -77,76 +77,9 @@ class Assembly:
     pairs: list[tuple[str, str]]
     intersecting: list[tuple[str, str]] = field(default_factory=list)
     conflicts: list[str] = field(default_factory=list)
+    habit: Habit = field(default_factory=Habit)
     seed: int = 0
     seconds: float = 0.0
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The measurements: values and sd (K, 6) in the order of `MEASUREMENTS`, the inflections' directions (K, 3); rad and mm."""
-
-    values: Array
-    sd: Array
-    inflection: Array
-
-    def residuals(self, q: Array) -> Array:
-        """Return (K, 6), assembled less measured in sd."""
-        predicted = q.copy()
-        predicted[:, 3] = stem_angles(q, self.inflection)
-        difference = predicted - self.values
-        difference[:, 0] = (difference[:, 0] + np.pi) % (2 * np.pi) - np.pi
-        return difference / self.sd
-
-    def jacobian(self, q: Array) -> Array:
-        """Return d residuals / d q, (K, 6, 6): only the stem angle depends on several coordinates."""
-        out = np.zeros((len(q), 6, 6))
-        for row, coordinate in enumerate(_ORDER):
-            if coordinate is not None:
-                out[:, row, coordinate] = 1 / self.sd[:, row]
-        for coordinate in range(6):
-            step = np.zeros(6)
-            step[coordinate] = 1e-6
-            slope = (stem_angles(q + step, self.inflection) - stem_angles(q - step, self.inflection)) / 2e-6
-            out[:, 3, coordinate] = slope / self.sd[:, 3]
-        return out
-
-
-def measured(placement: Placement, names: list[str], inflection: Array, *, heading_u: float = 5.0, roll_u: float = 5.0) -> Measured:
-    """Return the measurements of a placement as arrays.
-
-    Parameters
-    ----------
-    placement, names : the measurements, and the petals' order.
-    inflection : (K, 3) directions of the midribs at their inflections in the petals' frames.
-    heading_u, roll_u : degrees; how far a petal may be turned out of the meridian plane of its base. Nobody measures these two: the
-        values are an assumption about flowers [U].
-    """
-    petals = [placement.petals[name] for name in names]
-    zero = [0.0] * len(petals)
-    columns = [
-        np.radians([p.azimuth for p in petals]),
-        [p.base_radius for p in petals],
-        [p.base_height for p in petals],
-        np.radians([p.stem_angle for p in petals]),
-        zero,
-        zero,
-    ]
-    base_u = [p.base_u for p in petals]
-    sd = [
-        np.radians([p.azimuth_u for p in petals]),
-        base_u,
-        base_u,
-        np.radians([p.stem_angle_u for p in petals]),
-        np.full(len(petals), np.radians(heading_u)),
-        np.full(len(petals), np.radians(roll_u)),
-    ]
-    return Measured(np.array(columns, float).T, np.array(sd, float).T, inflection)
-
-
-def start_coordinates(m: Measured) -> Array:
-    """Return the coordinates (K, 6) that the measurements alone give."""
-    v = m.values
-    return measured_coordinates(np.degrees(v[:, 0]), v[:, 1], v[:, 2], np.degrees(v[:, 3]), m.inflection)
 
 
 def ranked_pairs(
@@ -202,61 +135,13 @@ def ranked_pairs(
 
 def _spread(q: Array, m: Measured, seen: Gaps) -> Array:
     """Return the standard uncertainty of each gap, mm, by the uncertainties of the two petals' coordinates."""
-    omega, v = twists(q)
-    variance = np.zeros(len(seen.i))
-    for petal, at in ((seen.i, seen.p), (seen.j, seen.c)):
-        rows = np.einsum("mci,mi->mc", omega[petal], np.cross(at, seen.n)) + np.einsum("mci,mi->mc", v[petal], seen.n)
-        variance += np.einsum("mc,mc->m", rows**2, m.sd[petal] ** 2)
-    return np.sqrt(variance)
-
-
-def _step(q: Array, m: Measured, seen: Gaps, sign: Array, weight: float, margin: float, caps: float) -> Array:
-    """Return one Gauss-Newton step (K, 6): the springs that act are found again as the linearised gaps change."""
-    from scipy.sparse import csr_matrix
-
-    k = len(q)
-    residual, jacobian = m.residuals(q), m.jacobian(q)
-    prior = np.zeros((6 * k, 6 * k))
-    right = np.zeros(6 * k)
-    for petal in range(k):
-        block = slice(6 * petal, 6 * petal + 6)
-        prior[block, block] = jacobian[petal].T @ jacobian[petal]
-        right[block] = -jacobian[petal].T @ residual[petal]
-    near = (sign != 0) & (sign * seen.height < margin + 1.5)
-    i, j, n = seen.i[near], seen.j[near], seen.n[near] * sign[near, None]
-    gap = sign[near] * seen.height[near]
-    omega, v = twists(q)
-    # d gap = n . (velocity of p - velocity of c); n . (omega x p) = omega . (p x n)
-    rows_i = np.einsum("mci,mi->mc", omega[i], np.cross(seen.p[near], n)) + np.einsum("mci,mi->mc", v[i], n)
-    rows_j = -np.einsum("mci,mi->mc", omega[j], np.cross(seen.c[near], n)) - np.einsum("mci,mi->mc", v[j], n)
-    columns = np.concatenate([6 * i[:, None] + np.arange(6), 6 * j[:, None] + np.arange(6)], 1)
-    rows = csr_matrix((np.concatenate([rows_i, rows_j], 1).ravel(), columns.ravel(), np.arange(len(i) + 1) * 12), (len(i), 6 * k))
-
-    def cost(step: Array) -> float:
-        return float(0.5 * step @ prior @ step - right @ step + 0.5 * weight**2 * (np.minimum(gap + rows @ step - margin, 0.0) ** 2).sum())
-
-    # A convex problem with kinks: Newton's direction for the springs that act, shortened until the cost falls.
-    step = np.zeros(6 * k)
-    for _ in range(12):
-        short = np.minimum(gap + rows @ step - margin, 0.0)
-        acting = rows[short < 0]
-        hessian = prior + weight**2 * (acting.T @ acting).toarray()
-        direction = np.linalg.solve(hessian, right - prior @ step - weight**2 * (rows.T @ short))
-        length, here = 1.0, cost(step)
-        while cost(step + length * direction) > here and length > 1e-3:
-            length /= 2
-        if length <= 1e-3 or np.abs(length * direction).max() < 1e-5:
-            break
-        step = step + length * direction
-    # Shortened petal by petal, not coordinate by coordinate: a step keeps its direction.
-    over = (np.abs(step.reshape(k, 6)) / (CAPS * caps)).max(1)
-    step = (step.reshape(k, 6) / np.maximum(over, 1.0)[:, None]).ravel()
-    return step.reshape(k, 6)
+    variance = sum((slopes(q, petal, at, seen.n) ** 2 * m.sd[petal] ** 2).sum(1) for petal, at in ((seen.i, seen.p), (seen.j, seen.c)))
+    return np.sqrt(np.asarray(variance))
 
 
 def _within(q: Array, m: Measured) -> Array:
     """Keep each coordinate within SPAN sd of its measurement, and the base on the outer side of the stem."""
-    start = start_coordinates(m)
+    start = m.start()
     half = SPAN * m.sd
     q = np.clip(q, start - half, start + half)
     q[:, RADIUS] = np.maximum(q[:, RADIUS], 0.0)
@@ -274,8 +159,7 @@ def assemble(
     margin: float = MARGIN,
     points: int = 500,
     steps: int = 8,
-    heading_u: float = 5.0,
-    roll_u: float = 5.0,
+    habit: Habit | None = None,
     progress: Progress | None = None,
 ) -> Assembly:
     """Put petals together.
@@ -291,7 +175,7 @@ def assemble(
     margin : gap that is aimed at where petals touch, mm.
     points : vertices of each petal that are looked at; all of them are in the final check.
     steps : Gauss-Newton steps at each weight.
-    heading_u, roll_u : see `measured`.
+    habit : what is assumed of the flower.
     progress : called with a word and a share of 0 to 1.
 
     Returns
@@ -308,12 +192,13 @@ def assemble(
     missing = [name for name in names if name not in placement.petals]
     if missing or not names:
         raise AssemblyError(f"{placement.source}: no placement for {', '.join(missing) or 'any petal'}: add [petals.NAME] for each petal")
+    habit = habit or Habit()
     tell = progress or (lambda word, share: None)
     rng = np.random.default_rng(seed)
     k = len(names)
-    m = measured(placement, names, inflection, heading_u=heading_u, roll_u=roll_u)
+    m = measured(placement, names, inflection, habit)
     to_petal = np.array([inverse(pose) for pose in T_scan_petal])
-    q = start_coordinates(m)
+    q = m.start()
     start = petal_poses(q) @ to_petal
     chosen = [samples(sheet, points, rng) for sheet in sheets]
     number = {name: index for index, name in enumerate(names)}
@@ -336,23 +221,31 @@ def assemble(
     def signs(seen: Gaps) -> Array:
         return side[seen.i, seen.j]
 
-    def merit(q: Array, seen: Gaps, weight: float) -> float:
-        return float(
-            (m.residuals(q) ** 2).sum() + weight**2 * (np.minimum(signs(seen) * seen.height - margin, 0.0)[signs(seen) != 0] ** 2).sum()
-        )
+    def judged(q: Array, seen: Gaps, weight: float) -> tuple[list[Terms], float]:
+        pairs = [(i, j) if i_inside else (j, i) for (i, j), i_inside in inside.items()]
+        terms = [
+            m.terms(q),
+            on_receptacle(q, habit.receptacle_u),
+            inner_nearer(q, pairs, habit.radius_u),
+            *apart_and_nestled(q, seen, signs(seen), habit, margin, weight),
+        ]
+        return terms, sum(part.cost for part in terms)
 
     best, least, caps, depth = q, np.inf, 1.0, REACH
     for stage, weight in enumerate(STAGES):
         seen = look(q, depth)
-        here = merit(q, seen, weight)
+        terms, here = judged(q, seen, weight)
         for turn in range(steps):
             tell("moving", (stage + turn / steps) / len(STAGES))
             depth = max(DEEPEST, depth * SHALLOWER)
-            trial = _within(q + _step(q, m, seen, signs(seen), weight, margin, caps), m)
+            step = step_down(terms).reshape(k, 6)
+            # Shortened petal by petal, not coordinate by coordinate: a step keeps its direction.
+            over = (np.abs(step) / (CAPS * caps)).max(1)
+            trial = _within(q + step / np.maximum(over, 1.0)[:, None], m)
             then = look(trial, depth)
-            there = merit(trial, then, weight)
+            ahead, there = judged(trial, then, weight)
             if there < here:
-                gained, q, seen, here, caps = here - there, trial, then, there, min(1.0, 2 * caps)
+                gained, q, seen, terms, here, caps = here - there, trial, then, ahead, there, min(1.0, 2 * caps)
                 if gained < 0.01 * here:
                     break
             else:
@@ -382,18 +275,23 @@ def assemble(
         residuals=residuals,
         pairs=sorted((names[i], names[j]) if i_inside else (names[j], names[i]) for (i, j), i_inside in inside.items()),
         intersecting=crossing,
-        conflicts=_conflicts(names, residuals, crossing),
+        conflicts=_conflicts(names, residuals, on_receptacle(q, habit.receptacle_u).residual, crossing),
+        habit=habit,
         seed=seed,
         seconds=time.monotonic() - began,
     )
 
 
-def _conflicts(names: list[str], residuals: Array, crossing: list[tuple[str, str]]) -> list[str]:
+def _conflicts(names: list[str], residuals: Array, off: Array, crossing: list[tuple[str, str]]) -> list[str]:
     out = []
-    for name, row in zip(names, residuals, strict=True):
+    for name, row, lift in zip(names, residuals, off, strict=False):
         for what, pull in zip(MEASUREMENTS, row, strict=True):
             if abs(pull) > CONFLICT:
-                out.append(f"{name}: {what} is {pull:+.1f} standard uncertainties from what was measured")
+                out.append(
+                    f"{name}: {what} is {pull:+.1f} standard uncertainties from what was {'assumed' if what in ASSUMED else 'measured'}"
+                )
+        if abs(lift) > CONFLICT:
+            out.append(f"{name}: its base lies {lift:+.1f} standard uncertainties off the receptacle")
     for a, b in crossing:
         pulls = [(abs(residuals[names.index(n), c]), n, what) for n in (a, b) for c, what in enumerate(MEASUREMENTS)]
         pull, name, what = max(pulls)

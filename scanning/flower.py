@@ -8,7 +8,7 @@ import json
 import math
 import platform
 import tomllib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +137,7 @@ def write_assembly(path: Path, assembly: Assembly) -> None:
         "inside": [list(pair) for pair in a.pairs],
         "intersecting": [list(pair) for pair in a.intersecting],
         "conflicts": a.conflicts,
+        "assumed": asdict(a.habit),
         "seed": a.seed,
         "seconds": round(a.seconds, 2),
         "versions": _versions(),

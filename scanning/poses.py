@@ -1,9 +1,12 @@
 """Where a petal stands in its flower, as the six coordinates that are measured or assumed.
 
-A petal's pose is written in generalised coordinates q = (azimuth, radius, height, tilt, heading, roll): the base point's cylindrical
-coordinates, the angle between the stem and the base-tip line, the turn of the petal's plane of symmetry away from its base's azimuth, and
-the turn about the base-tip line. At heading 0 and roll 0 the petal's y and z axes lie in the meridian plane of its base, its inner face to
-the stem. Each measurement is then one coordinate, or (the stem angle) one function of them.
+A petal's pose is written in generalised coordinates q = (azimuth, radius, height, tilt, side, roll): the direction in which the petal grows
+out of the receptacle, how far along it and how high its base point stands, the angle between the stem and the base-tip line, how far the
+base point lies beside the meridian plane, and the turn about the base-tip line. At side 0 and roll 0 the petal's y and z axes lie in the
+meridian plane, its inner face to the stem. Each measurement is then one coordinate, or (the stem angle) one function of them.
+
+A base is millimetres wide and stands millimetres from the stem: its azimuth is where its middle faces, and a base point found a little too
+far to one side must not turn the petal.
 """
 
 import numpy as np
@@ -11,19 +14,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-AZIMUTH, RADIUS, HEIGHT, TILT, HEADING, ROLL = range(6)
-ANGLES = (AZIMUTH, TILT, HEADING, ROLL)
+AZIMUTH, RADIUS, HEIGHT, TILT, SIDE, ROLL = range(6)
+ANGLES = (AZIMUTH, TILT, ROLL)
 
 
 def _axes(q: Array) -> tuple[Array, Array, Array, Array]:
     """Return base points, and the tangential (x = -tangential), base-tip and inner-face directions before roll, each (K, 3)."""
-    azimuth, radius, height, tilt, heading, _ = q.T
+    azimuth, radius, height, tilt, side, _ = q.T
     zero = np.zeros_like(azimuth)
-    base = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], -1)
-    course = azimuth + heading
-    outward = np.stack([np.cos(course), np.sin(course), zero], -1)
-    tangent = np.stack([-np.sin(course), np.cos(course), zero], -1)
+    outward = np.stack([np.cos(azimuth), np.sin(azimuth), zero], -1)
+    tangent = np.stack([-np.sin(azimuth), np.cos(azimuth), zero], -1)
     up = np.array([0.0, 0.0, 1.0])
+    base = radius[:, None] * outward + side[:, None] * tangent + height[:, None] * up
     midrib = np.cos(tilt)[:, None] * up + np.sin(tilt)[:, None] * outward
     inner = np.sin(tilt)[:, None] * up - np.cos(tilt)[:, None] * outward
     return base, tangent, midrib, inner
@@ -34,7 +36,7 @@ def petal_poses(q: Array) -> Array:
 
     Parameters
     ----------
-    q : (K, 6) azimuth, radius, height, tilt, heading, roll; radians and mm.
+    q : (K, 6) azimuth, radius, height, tilt, side, roll; radians and mm.
 
     Returns
     -------
@@ -69,8 +71,9 @@ def twists(q: Array) -> tuple[Array, Array]:
     omega, v = np.zeros((len(q), 6, 3)), np.zeros((len(q), 6, 3))
     omega[:, AZIMUTH] = up
     v[:, RADIUS] = np.stack([np.cos(q[:, AZIMUTH]), np.sin(q[:, AZIMUTH]), np.zeros(len(q))], -1)
+    v[:, SIDE] = tangent
     v[:, HEIGHT] = up
-    for coordinate, axis in ((TILT, tangent), (HEADING, up), (ROLL, midrib)):
+    for coordinate, axis in ((TILT, tangent), (ROLL, midrib)):
         omega[:, coordinate] = axis
         v[:, coordinate] = -np.cross(np.broadcast_to(axis, base.shape), base)
     return omega, v
@@ -93,7 +96,7 @@ def stem_angles(q: Array, inflection: Array) -> Array:
 
 
 def measured_coordinates(azimuth: Array, radius: Array, height: Array, stem_angle: Array, inflection: Array) -> Array:
-    """Return the coordinates that have the measured values, heading and roll 0.
+    """Return the coordinates that have the measured values, side and roll 0.
 
     Parameters
     ----------

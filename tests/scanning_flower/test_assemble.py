@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scanning.assemble import Assembly, AssemblyError, assemble
 from scanning.contact import Sheet, clearance, crossings, gaps, samples
 from scanning.placement import Neighbour, PetalPlacement, Placement
 from scanning.poses import Array, moved
+from scanning.terms import Habit
 from tests.scanning_flower import nested
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -28,9 +30,9 @@ def placed(name: str, other: str, side: str, radius: float, stem_angle: float = 
     return PetalPlacement(name, neighbour, neighbour, stem_angle, 0.0, radius, 0.0, **more)
 
 
-def two(first: PetalPlacement, second: PetalPlacement, **options: float) -> Assembly:
+def two(first: PetalPlacement, second: PetalPlacement, **options: Any) -> Assembly:
     placement = Placement("two", {p.name: p for p in (first, second)})
-    return assemble(["A", "B"], [flat(), flat()], np.array([np.eye(4)] * 2), np.array([UP] * 2), placement, **options)  # type: ignore[arg-type]
+    return assemble(["A", "B"], [flat(), flat()], np.array([np.eye(4)] * 2), np.array([UP] * 2), placement, **options)
 
 
 def test_a_petal_alone_stands_as_measured() -> None:
@@ -52,9 +54,42 @@ def test_parallel_sheets_too_near_are_pushed_apart_evenly() -> None:
     np.testing.assert_allclose(found.residuals[0], -found.residuals[1], atol=0.02)
 
 
-def test_far_sheets_stay_where_they_were_measured() -> None:
-    found = two(placed("A", "B", "outside", 4.0), placed("B", "A", "inside", 6.0))
+def test_sheets_that_lie_against_each_other_stay_where_they_were_measured() -> None:
+    found = two(placed("A", "B", "outside", 4.0), placed("B", "A", "inside", 4.4))
     np.testing.assert_allclose(found.poses, found.start, atol=1e-9)
+
+
+def test_petals_measured_far_apart_are_brought_together_unless_nothing_is_assumed_of_them() -> None:
+    pair = placed("A", "B", "outside", 4.0), placed("B", "A", "inside", 6.0)
+    # Two radii of 1 mm and what is assumed of the gap, 0.5 mm give or take 0.3: 0.5 + 1.5 * 0.09 / (2 + 0.09) where sheets only shift.
+    assert 0.5 < two(*pair).clearance < 0.57
+    free = two(*pair, habit=Habit(nestle=np.inf))
+    np.testing.assert_allclose(free.poses, free.start, atol=1e-9)
+
+
+def test_of_two_petals_side_by_side_the_inner_one_comes_to_grow_nearer_to_the_stem() -> None:
+    facing = {"A": 0.0, "B": 180.0}
+    petals = {"A": placed("A", "B", "outside", 5.0), "B": placed("B", "A", "inside", 4.0)}
+    placement = Placement("two", {name: replace(petal, azimuth=facing[name]) for name, petal in petals.items()})
+    found = assemble(["A", "B"], [flat(), flat()], np.array([np.eye(4)] * 2), np.array([UP] * 2), placement)
+    # 1 mm too much against sd 0.3 mm; each base is known to 1 mm: (1, 1, 0.3)-weighted least squares.
+    inner, outer = (np.hypot(*pose[:2, 3]) for pose in found.poses)
+    assert inner - outer == pytest.approx(0.09 / 2.09, abs=1e-6)
+
+
+def test_bases_come_to_lie_on_one_receptacle() -> None:
+    names = [f"P{i}" for i in range(8)]
+    rng = np.random.default_rng(1)
+    lifted = {name: 2.0 + 0.3 * (3 + i) + rng.normal(0, 1) for i, name in enumerate(names)}
+    petals = {name: PetalPlacement(name, None, None, 40.0, 45.0 * i, 3.0 + i, lifted[name]) for i, name in enumerate(names)}
+    small = [flat(0.5, 1.0, 3)] * 8
+    found = assemble(names, small, np.array([np.eye(4)] * 8), np.array([UP] * 8), Placement("many", petals))
+    off = []
+    for poses in (found.start, found.poses):
+        radius, height = np.hypot(poses[:, 0, 3], poses[:, 1, 3]), poses[:, 2, 3]
+        off.append(np.std(height - np.polyval(np.polyfit(radius, height, 1), radius)))
+    # Each height is known to 1 mm, the receptacle to 0.3 mm; the radii take a little of it.
+    assert off[1] < 0.09 / 1.09 * off[0] * 1.05
 
 
 @pytest.mark.parametrize("outer", ["A", "B"])
@@ -83,7 +118,7 @@ def test_an_impossible_flower_is_marked_and_its_conflict_named() -> None:
     # B must be outside of A, but is surely measured 3 mm inside of it, leaning the other way.
     first = placed("A", "B", "outside", 5.0, 3.0, base_u=0.05, stem_angle_u=0.1, azimuth_u=0.1)
     second = placed("B", "A", "inside", 4.0, 14.0, base_u=0.05, stem_angle_u=0.1, azimuth_u=0.1)
-    found = two(first, second, heading_u=0.1, roll_u=0.1)
+    found = two(first, second, habit=Habit(side_u=0.05, roll_u=0.1, receptacle_u=0.05))
     assert found.state == "intersecting"
     assert found.clearance == 0
     assert found.intersecting == [("A", "B")]

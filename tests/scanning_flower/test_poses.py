@@ -20,7 +20,9 @@ def test_poses_are_rigid_and_put_the_base_where_it_was_measured(q: tuple[float, 
     pose = petal_poses(np.array([q]))[0]
     np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) > 0.999
-    np.testing.assert_allclose([np.hypot(*pose[:2, 3]), pose[2, 3]], q[1:3], atol=1e-12)
+    along = np.array([np.cos(q[0]), np.sin(q[0])])
+    np.testing.assert_allclose([along @ pose[:2, 3], pose[2, 3]], q[1:3], atol=1e-12)
+    np.testing.assert_allclose(along @ [pose[1, 3], -pose[0, 3]], q[4], atol=1e-12)
 
 
 @given(coordinates, st.integers(0, 5))
