@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from render.errors import RenderError
 from render.viewer import (
+    COLLIDING,
     Page,
     Petal,
     PetalArrays,
-    Rgb,
+    add_notes,
     add_petal,
     aim_camera,
     bounds,
@@ -28,7 +29,6 @@ from render.viewer import (
 if TYPE_CHECKING:
     import viser
 
-COLLIDING: Rgb = (214, 74, 0)
 _QUIET_S = 0.15
 
 Poses = dict[str, NDArray[np.float64]]
@@ -40,10 +40,11 @@ def serve_editor(
     *,
     bases: Mapping[str, ArrayLike],
     angles: Callable[[str, NDArray[np.float64]], Angles],
-    pose: Callable[[str, float, float], ArrayLike],
+    turned: Callable[[str, NDArray[np.float64], float, float], ArrayLike],
     collisions: Callable[[Poses], Collection[str]],
     save: Callable[[Poses], str | None],
     title: str = "Flower editor",
+    notes: Sequence[str] = (),
     port: int = 0,
 ) -> Editor:
     """Open a page of this machine on which petals are moved by hand.
@@ -56,9 +57,9 @@ def serve_editor(
         Petal's name to its base point (3,) in mm in the scan frame: where its handle sits.
     angles : callable
         ``angles(name, T_flower_scan)`` gives the stem angle and the azimuth, in degrees, of a petal lying there.
-    pose : callable
-        ``pose(name, stem_angle, azimuth)`` gives the ``T_flower_scan`` of a petal grown as recorded, at these angles in degrees;
-        another stem angle turns it about its base, another azimuth about the stem.
+    turned : callable
+        ``turned(name, T_flower_scan, stem_angle, azimuth)`` gives the ``T_flower_scan`` of a petal brought from where it lies to
+        these angles in degrees: to another stem angle about its base, to another azimuth about the stem, all else as it is.
     collisions : callable
         ``collisions(poses)`` names the petals that touch others, given every petal's ``T_flower_scan``; may be slow.
         It runs in a thread of its own, one call at a time.
@@ -66,6 +67,8 @@ def serve_editor(
         ``save(poses)`` keeps every petal's ``T_flower_scan``; what it returns, e.g. the file's name, is shown on the page.
     title : str
         Heading of the page.
+    notes : sequence of str
+        Lines to show above the controls.
     port : int
         TCP port; 0 takes a free one.
 
@@ -84,8 +87,8 @@ def serve_editor(
         raise RenderError(f"bases are given for {', '.join(sorted(bases)) or 'no petal'}, but the petals are {', '.join(sorted(flower))}")
     points = {name: _point(name, bases[name]) for name in flower}
     for name, petal in flower.items():
-        rigid(name, pose(name, *angles(name, petal.pose)))
-    return Editor(open_server(title, port), flower, points, angles, pose, collisions, save)
+        rigid(name, turned(name, petal.pose, *angles(name, petal.pose)))
+    return Editor(open_server(title, port), flower, points, angles, turned, collisions, save, notes)
 
 
 class Editor(Page):
@@ -103,12 +106,13 @@ class Editor(Page):
         flower: Mapping[str, Petal],
         bases: Mapping[str, NDArray[np.float64]],
         angles: Callable[[str, NDArray[np.float64]], Angles],
-        pose: Callable[[str, float, float], ArrayLike],
+        turned: Callable[[str, NDArray[np.float64], float, float], ArrayLike],
         collisions: Callable[[Poses], Collection[str]],
         save: Callable[[Poses], str | None],
+        notes: Sequence[str],
     ) -> None:
         super().__init__(server)
-        self._bases, self._angles, self._pose, self._save = bases, angles, pose, save
+        self._bases, self._angles, self._turned, self._save = bases, angles, turned, save
         self._lock = threading.RLock()
         self._saving = threading.Lock()
         self._poses: Poses = {name: petal.pose for name, petal in flower.items()}
@@ -119,6 +123,9 @@ class Editor(Page):
         self._colours = petal_colours(flower)
         self._meshes = {name: add_petal(server, name, petal, self._colours[name], bases[name]) for name, petal in flower.items()}
         self._checks = Checks(collisions, self._show_collisions)
+        add_notes(server, notes)
+        # In the frame of the handle, which sits on the base.
+        self._middles = {name: petal.vertices.mean(axis=0) - bases[name] for name, petal in flower.items()}
         self._lay_out(bounds(flower)[1])
         aim_camera(server, flower)
         self._show_selected()
@@ -172,19 +179,14 @@ class Editor(Page):
     def turn(self, name: str, *, stem_angle: float | None = None, azimuth: float | None = None) -> None:
         """Turn a petal to other angles, in degrees: to a stem angle about its base, to an azimuth about the stem.
 
-        What the hand changed besides (roll, shift of the base) stays: the petal bends about its own hinge, as `pose` would bend
-        it, wherever it lies now; and it goes round the stem as it is.
+        What the hand changed besides (roll, shift of the base) stays.
         """
         with self._lock:
             self._known(name)
             old_stem, old_azimuth = self._angles_now[name]
             new_stem = old_stem if stem_angle is None else stem_angle
             new_azimuth = old_azimuth if azimuth is None else azimuth
-            before, bent, turned = (
-                rigid(name, self._pose(name, *pair)) for pair in ((old_stem, old_azimuth), (new_stem, old_azimuth), (new_stem, new_azimuth))
-            )
-            # Bending is a motion in the petal's own frame, so on the right; going round is one in the flower's frame, on the left.
-            self.move(name, turned @ np.linalg.inv(bent) @ self._poses[name] @ np.linalg.inv(before) @ bent)
+            self.move(name, self._turned(name, self._poses[name].copy(), new_stem, new_azimuth))
 
     def save(self) -> None:
         """Hand all poses to the `save` callable; the status line tells how it went."""
@@ -212,12 +214,14 @@ class Editor(Page):
 
     def _lay_out(self, radius: float) -> None:
         gui, scene = self._server.gui, self._server.scene
+        gui.add_markdown("Drag the handle's arrows and squares to shift the petal, its arcs to turn it. Orange petals pass through others.")
         self._list = gui.add_dropdown("Petal", tuple(self._poses), initial_value=self._selected, hint="or click on it")
         self._stem_slider = gui.add_slider("Stem angle (°)", 0.0, 180.0, 0.1, 0.0, hint="turns the petal about its base")
         self._azimuth_slider = gui.add_slider("Azimuth (°)", 0.0, 360.0, 0.1, 0.0, hint="turns the petal about the stem")
         self._save_button = gui.add_button("Save")
         self._status = gui.add_text("Status", "", multiline=True, disabled=True)
         self._handle = scene.add_transform_controls("/handle", scale=0.6 * radius, depth_test=False)
+        self._label = scene.add_label("/handle/petal", self._selected, position=self._middles[self._selected], anchor="center-center")
 
         # Coroutines run in the order of the events; plain functions would run in any. Events of our own (no client) are done with.
         @self._list.on_update
@@ -271,6 +275,8 @@ class Editor(Page):
             name = self._selected
             stem_angle, azimuth = self._angles_now[name]
             _put(self._list, name)
+            if self._label.text != name:
+                self._label.text, self._label.position = name, self._middles[name]
             _put(self._stem_slider, round(stem_angle, 1))
             _put(self._azimuth_slider, round(azimuth, 1) % 360)
             rotation, position = node_pose(self._poses[name], self._bases[name])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import socket
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -21,12 +22,15 @@ if TYPE_CHECKING:
 
 # Whoever reaches the page can move petals and save: nobody but this machine may.
 HOST = "127.0.0.1"
-PETAL_COLOUR = np.array([236, 188, 204])
+PETAL_COLOUR = (0.85, 0.30, 0.43)  # linear red, green, blue, 0 to 1
+_BACKGROUND = 200  # grey: pale petals must stand out as well as dark ones
 _FIELD_OF_VIEW = 45.0  # degrees, vertical
 _TOWARDS_VIEWER = np.array([1.0, -1.2, 1.0])
 
 Rgb = tuple[int, int, int]
+Hue = tuple[float, float, float]
 PetalArrays = tuple[ArrayLike, ArrayLike, ArrayLike]
+COLLIDING: Rgb = (214, 74, 0)
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,13 @@ class Page:
 
 
 def serve_viewer(
-    petals: Mapping[str, PetalArrays], *, title: str = "Flower", port: int = 0, colours: Mapping[str, Rgb] | None = None
+    petals: Mapping[str, PetalArrays],
+    *,
+    title: str = "Flower",
+    port: int = 0,
+    colours: Mapping[str, Rgb] | None = None,
+    hue: Hue | None = None,
+    notes: Sequence[str] = (),
 ) -> Page:
     """Show a flower on a page of this machine.
 
@@ -93,7 +103,11 @@ def serve_viewer(
     port : int
         TCP port; 0 takes a free one.
     colours : mapping, optional
-        Petal's name to red, green, blue, 0 to 255; those not named are pink.
+        Petal's name to red, green, blue, 0 to 255; for those that are not to have the flower's.
+    hue : tuple of float, optional
+        The flower's linear red, green, blue, 0 to 1, as for pictures; else pink.
+    notes : sequence of str
+        Lines to show beside the flower.
 
     Returns
     -------
@@ -106,7 +120,7 @@ def serve_viewer(
         The optional viewer is not installed, the port is taken, or a petal's arrays are not a mesh and a rigid motion.
     """
     flower = checked(petals)
-    chosen = petal_colours(flower)
+    chosen = petal_colours(flower, hue or PETAL_COLOUR)
     if unknown := sorted(set(colours or {}) - set(flower)):
         raise RenderError(f"colours are given for {', '.join(unknown)}, but the flower's petals are {', '.join(flower)}")
     chosen.update(colours or {})
@@ -114,7 +128,8 @@ def serve_viewer(
     for name, petal in flower.items():
         add_petal(server, name, petal, chosen[name])
     aim_camera(server, flower)
-    server.gui.add_markdown(f"{len(flower)} petals. Drag to turn, right drag to shift, wheel to come closer.")
+    add_notes(server, [f"{len(flower)} petals", *notes])
+    server.gui.add_markdown("Drag to turn, right drag to shift, wheel to come closer.")
     return Page(server)
 
 
@@ -147,8 +162,15 @@ def open_server(title: str, port: int) -> viser.ViserServer:
             raise RenderError(f"port {port} of {HOST} was taken in the meantime; choose another one, or 0 for a free one")
     # Its share button would open a tunnel for the whole world; a client may ask for it without the button, too.
     server.__dict__["request_share_url"] = _no_sharing
+    server.scene.set_background_image(np.full((2, 2, 3), _BACKGROUND, dtype=np.uint8))
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     return server
+
+
+def add_notes(server: viser.ViserServer, notes: Sequence[str]) -> None:
+    """Show lines of text as they are, each a paragraph of its own."""
+    if notes:
+        server.gui.add_markdown("\n\n".join(re.sub(r"([\\`*_{}\[\]<>#|])", r"\\\1", note) for note in notes))
 
 
 def add_petal(server: viser.ViserServer, name: str, petal: Petal, colour: Rgb, origin: ArrayLike = (0.0, 0.0, 0.0)) -> viser.MeshHandle:
@@ -192,10 +214,12 @@ def bounds(flower: Mapping[str, Petal]) -> tuple[NDArray[np.float64], float]:
     return centre, float(np.linalg.norm(points - centre, axis=1).max())
 
 
-def petal_colours(flower: Mapping[str, Petal]) -> dict[str, Rgb]:
-    """Pink for each petal, a little lighter or darker than its neighbours so that their edges show."""
-    shades = 0.80 + 0.20 * np.modf(np.arange(len(flower)) * 0.618)[0]
-    return {name: _rgb(shade * PETAL_COLOUR) for name, shade in zip(flower, shades, strict=True)}
+def petal_colours(flower: Mapping[str, Petal], hue: Hue = PETAL_COLOUR) -> dict[str, Rgb]:
+    """One hue (linear red, green, blue, 0 to 1) for all petals, a little lighter or darker than its neighbours so that edges show."""
+    linear = np.asarray(hue, dtype=float)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)  # sRGB, IEC 61966-2-1
+    shades = 0.74 + 0.26 * np.modf(np.arange(len(flower)) * 0.618)[0]
+    return {name: _rgb(255 * shade * encoded) for name, shade in zip(flower, shades, strict=True)}
 
 
 def checked(petals: Mapping[str, PetalArrays]) -> dict[str, Petal]:

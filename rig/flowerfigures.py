@@ -17,7 +17,9 @@ DETAIL = 0.28
 """Side of figure 13's box, as a part of the picture's."""
 
 
-def draw_flower(flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, simulated: bool) -> tuple[list[Path], str]:
+def draw_flower(
+    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, simulated: bool, shades: Shades | None = None
+) -> tuple[list[Path], str]:
     """Draw figures 11, 13 and 14 as PNG into `folder`; return the files and the table of contrasts.
 
     Parameters
@@ -29,6 +31,8 @@ def draw_flower(flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, 
         Made where it is not there.
     simulated : bool
         Whether petals or readings are virtual: the figures then say so.
+    shades : Shades, optional
+        Reflectance tables that exist already.
     """
     from render.camera import Box
     from render.contrast import measure_contrast
@@ -39,7 +43,7 @@ def draw_flower(flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, 
 
     folder.mkdir(parents=True, exist_ok=True)
     scene = read_flower(flower)
-    raycaster, shades = Raycaster(scene), Shades({})
+    raycaster, shades = Raycaster(scene), shades or Shades({})
     camera = frame(raycaster, SIDE, SIDE)
     written = [folder / f"figure-{number}.png" for number in (11, 13, 14)]
 

@@ -9,7 +9,7 @@ from rig.errors import RunError
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where things lie: `runs/`, `fits/`, `figures/` and `cultivars.toml` under one root."""
+    """Where things lie: `runs/`, `fits/`, `figures/`, `flowers/` and `cultivars.toml` under one root."""
 
     root: Path
 
@@ -32,6 +32,11 @@ class Workspace:
     def figures(self) -> Path:
         """Folder of the figures."""
         return self.root / "figures"
+
+    @property
+    def flowers(self) -> Path:
+        """Folder of the flowers, one folder each."""
+        return self.root / "flowers"
 
     @property
     def cultivars(self) -> Path:

@@ -1,15 +1,15 @@
 """From a raw range image to the points of one petal.
 
-The scanner looks along z: a jump is a difference of depth between neighbours on the grid. Depth alone is smoothed: x and y stay as
-measured, so the outline of the petal cannot move, and a polynomial of second order through each point's own side of the rim (moving least
-squares, one-sided at the rim) neither shrinks a curved surface nor pulls the rim's depth inwards, as a mean or a Gaussian would.
+The scanner looks along z: a jump is a difference of depth between neighbours on the grid. Depth is smoothed by a polynomial of second order
+through each point's own side of the rim (moving least squares, one-sided at the rim): it neither shrinks a curved surface nor pulls the
+rim's depth inwards, as a mean or a Gaussian would. x and y stay as measured, but at the rim: the grid's staircase lies up to a step inside
+the outline, and each of its points moves, within half a step, to the border half way between what was measured and what was not.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,11 @@ from scanning.rangeimage import Array, RangeImage
 
 _LEAST_POINTS = 25
 _SAMPLE = 4096
+_SAMPLED = 10_000
+_LEAST_RADIUS, _MOST_RADIUS = 3, 10  # of the smoothing window, grid steps
+_RADIUS_FOR_NOISE = 13.0  # measured on scans of virtual petals
+_RIM_BLUR = 1.0  # grid steps: corners of the outline sharper than that are rounded
+_RIM_MOVE = 0.49  # grid steps, at most
 _LEAST_LEVELS = 5  # two surfaces parted by a jump are not a quantum
 
 
@@ -37,7 +42,7 @@ class Cleaning:
     behind : float, optional, mm
         Everything with z below is background. What a jump separates from the petal, and lines the window's border, goes anyway.
     smooth : int, optional
-        Radius of the smoothing window, grid steps; 0 leaves depths as measured. By default 3, and 5 where depth is quantised coarsely.
+        Radius of the smoothing window, grid steps; 0 leaves points as measured. By default 3 to 10, by the noise (see `default_radius`).
     """
 
     grazing: float = 80.0
@@ -64,7 +69,7 @@ class Cleaned:
     Attributes
     ----------
     image : RangeImage
-        The points that stay, depth smoothed.
+        The points that stay, depth smoothed and the rim's staircase straightened.
     jump : float, mm
         Depth difference taken for a jump.
     quantum : float, mm
@@ -101,50 +106,86 @@ def clean(image: RangeImage, how: Cleaning | None = None) -> Cleaned:
 
     how = how or Cleaning()
     step = image.step
-    depth = np.ascontiguousarray(image.points[..., 2])
+    depth = np.where(image.valid, image.points[..., 2], np.nan)
     quantum = depth_quantum(depth[image.valid])
     jump = how.jump if how.jump is not None else step * math.tan(math.radians(how.grazing)) + quantum
     removed: dict[str, int] = {}
-    valid = image.valid
 
     def drop(reason: str, bad: NDArray[np.bool_]) -> None:
-        nonlocal valid
-        gone = valid & bad
-        removed[reason] = removed.get(reason, 0) + int(gone.sum())
-        valid = valid & ~bad
-        if int(valid.sum()) < _LEAST_POINTS:
+        gone = bad & ~np.isnan(depth)
+        depth[gone] = np.nan
+        removed[reason] = removed.get(reason, 0) + int(np.count_nonzero(gone))
+        left = int(image.valid.sum()) - sum(removed.values())
+        if left < _LEAST_POINTS:
             raise EmptyScanError(
-                f"only {int(valid.sum())} points are left after removing {', '.join(f'{n} ({why})' for why, n in removed.items())}",
+                f"only {left} points are left after removing {', '.join(f'{n} ({why})' for why, n in removed.items())}",
                 file=image.source or None,
                 expected=f"at least {_LEAST_POINTS}",
                 hint="Loosen the cleaning, or scan again",
             )
 
-    with np.errstate(invalid="ignore"):
-        drop("background", np.zeros_like(valid) if how.behind is None else depth < how.behind)
-        drop("background", background(*grid.islands(depth, valid, jump)))
-        far = grid.rim_distance(depth, valid, jump, 3)
-        plane = grid.local_fit(depth, valid, jump, far, *_fit_weights(3, 1, False), True)
-        residual = np.abs(plane - depth)
-        known = residual[np.isfinite(residual)]
-        spread = 1.4826 * float(np.median(known)) if known.size else 0.0
-        drop("spike", residual > max(how.spike * spread, step))
-        drop("grazing", _grazing(image.points, valid, step, how.grazing, quantum))
-        label, count = grid.islands(depth, valid, jump)
-        largest = int(np.argmax(np.bincount(label.ravel(), minlength=count + 1)[1:])) + 1
-        drop("island", label != largest)
+    def drop_islands(label: NDArray[np.int32], count: int) -> None:
+        if count > 1:
+            here = np.where(np.isnan(depth), 0, label)
+            drop("island", here != int(np.argmax(np.bincount(here.ravel(), minlength=count + 1)[1:])) + 1)
 
-    radius = how.smooth if how.smooth is not None else (5 if quantum > step / 4 else 3)
-    roughness_radius = radius or 3
-    far = grid.rim_distance(depth, valid, jump, roughness_radius)
-    fitted = grid.local_fit(depth, valid, jump, far, *_fit_weights(roughness_radius, 2, True), False)
-    smooth = np.where(np.isfinite(fitted), fitted, depth)  # a point that too few others bear out stays as measured
-    roughness = float(np.sqrt(np.mean((smooth[valid] - depth[valid]) ** 2)))
-    points = image.points.copy()
-    if radius:
-        points[..., 2] = smooth
-    points[~valid] = np.nan
+    drop("background", np.zeros(image.shape, dtype=bool) if how.behind is None else depth < how.behind)
+    label, count = grid.islands(depth, jump)
+    drop("background", background(label, count))
+    front = ~np.isnan(depth)
+    removed |= {"spike": 0, "grazing": 0, "island": 0}
+    # What hangs free goes first: every window with a jump is gone through point by point.
+    drop_islands(label, count)
+    far = grid.rim_distance(depth, jump, 3)
+    residual = np.abs(grid.plane_residual(depth, far, jump, fit_weights(3)))
+    spread = 1.4826 * _median(residual)
+    drop("spike", residual > max(how.spike * spread, step))
+    drop("grazing", grid.too_steep(depth, jump, 2 * step * math.tan(math.radians(how.grazing)), quantum))
+    drop_islands(*grid.islands(depth, jump))
+
+    radius = how.smooth if how.smooth is not None else default_radius(spread, step)
+    weights = fit_weights(radius or _LEAST_RADIUS)
+    far = grid.rim_distance(depth, jump, len(weights) // 2)
+    valid = far >= 0
+    # A point removed beside the petal was most likely half on it.
+    cover = np.where(valid, 1.0, np.where(front & _beside(valid), 0.5, 0.0))
+    move = grid.rim_moves(cover, far, _RIM_BLUR, _RIM_MOVE) if radius else np.zeros((*valid.shape, 2))
+    smooth = grid.smoothed(depth, far, jump, weights, move)
+    off = (smooth - depth)[far > 0]
+    roughness = float(np.sqrt(np.mean(off * off))) if off.size else 0.0
+    points = grid.moved(image.points, depth, smooth if radius else depth, move)
     return Cleaned(RangeImage(points, valid, image.source), jump, quantum, roughness, removed)
+
+
+def default_radius(noise: float, step: float) -> int:
+    """Radius of the smoothing window, grid steps, at which noise of depth (both mm) tilts the surface by about a degree.
+
+    Halving a radius makes the tilt about four times larger.
+    """
+    return int(np.clip(round(_RADIUS_FOR_NOISE * math.sqrt(noise / step)), _LEAST_RADIUS, _MOST_RADIUS))
+
+
+def fit_weights(radius: int) -> Array:
+    """Weights of the points of a window along either axis: a Gaussian of half the radius' width, shape (2 radius + 1,)."""
+    offset = np.arange(-radius, radius + 1) / radius
+    return np.asarray(np.exp(-2 * offset * offset))
+
+
+def _median(values: Array) -> float:
+    """Median of what is finite in a sample; 0 where nothing is."""
+    flat = values.ravel()[:: max(1, values.size // _SAMPLED)]
+    flat = flat[np.isfinite(flat)]
+    return float(np.median(flat)) if flat.size else 0.0
+
+
+def _beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Places with one of their four neighbours in the mask."""
+    beside = np.zeros_like(mask)
+    beside[1:] |= mask[:-1]
+    beside[:-1] |= mask[1:]
+    beside[:, 1:] |= mask[:, :-1]
+    beside[:, :-1] |= mask[:, 1:]
+    return beside
 
 
 def depth_quantum(depth: Array) -> float:
@@ -171,34 +212,3 @@ def background(label: NDArray[np.int32], count: int) -> NDArray[np.bool_]:
     if not framing.any() or inner.size == 0 or inner.max() < max(_LEAST_POINTS, sizes[framing].max() / 100):
         return np.zeros(label.shape, dtype=bool)
     return np.asarray(framing[label])
-
-
-def _grazing(points: Array, valid: NDArray[np.bool_], step: float, angle: float, quantum: float) -> NDArray[np.bool_]:
-    """Points whose depth rises, over two steps of the grid, as steeply as the grazing angle on both axes' mean, quantum allowed for."""
-    depth = np.where(valid, points[..., 2], np.nan)
-    rise = np.zeros(depth.shape)
-    for axis in (0, 1):
-        moved = np.moveaxis(depth, axis, 0)
-        slope = np.zeros(moved.shape)
-        slope[1:-1] = np.nan_to_num(np.abs(moved[2:] - moved[:-2]), nan=0.0)
-        rise += np.moveaxis(np.maximum(slope - quantum, 0.0), 0, axis) ** 2
-    return np.asarray(rise > (2 * step * math.tan(math.radians(angle))) ** 2)
-
-
-@lru_cache(maxsize=32)
-def _fit_weights(radius: int, order: int, middle: bool) -> tuple[Array, Array, Array]:
-    """Tables of a local polynomial fit, for `grid.local_fit`: weighted basis, its moments, and the fit over a full window as a kernel.
-
-    Weights are Gaussian, of half the radius' width; without its middle, a point does not bear itself out.
-    """
-    offset = np.arange(-radius, radius + 1) / radius
-    v, u = (axis.ravel() for axis in np.meshgrid(offset, offset, indexing="ij"))
-    weights = np.exp(-2 * (u * u + v * v))
-    if not middle:
-        weights[weights.size // 2] = 0.0
-    basis = np.stack([np.ones_like(u), u, v] + ([u * u, u * v, v * v] if order == 2 else []), axis=1)
-    weighted = weights[:, None] * basis
-    rows, columns = np.tril_indices(basis.shape[1])
-    kernel = np.linalg.solve(basis.T @ weighted, weighted.T)[0]
-    size = 2 * radius + 1
-    return weighted, np.ascontiguousarray(weighted[:, rows] * basis[:, columns]), np.ascontiguousarray(kernel.reshape(size, size))

@@ -157,7 +157,7 @@ def _import(
     image = read_range_image(path, unit=unit)
     cleaned = clean(image, cleaning)
     mesh = triangulate(cleaned.image, cleaned.jump)
-    petal = measure_petal(mesh, name=f"{path} (petal {name})", base=base)
+    petal = measure_petal(mesh, name=name, file=str(path), base=base)
     quality: dict[str, float | int] = {
         "points_measured": int(image.valid.sum()),
         "points": len(mesh.vertices),

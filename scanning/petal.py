@@ -1,7 +1,8 @@
 """A petal's own geometry: base and tip, midrib, frame, and where its curvature changes sign.
 
-The base is known by the claw, the narrow end by which a petal hangs: of all points of the rim it has the least surface around it. The tip
-lies where the line from the base through the centre of area leaves the petal. Inner face: the one that looked at the sensor.
+The base is known by the claw, the narrow end by which a petal hangs: of all places of the rim it has the least surface around it, and the
+rim turns back most sharply there. The tip lies where the line from the base through the centre of area leaves the petal. Inner face: the
+one that looked at the sensor.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from numpy.typing import NDArray
 from scanning.errors import PetalError
 from scanning.mesh import Array, TriangleMesh, area, area_vectors, boundary_loops, loop_length, vertex_areas
 
-_REACH = 0.2  # radius within which surface around a rim point is counted, in roots of the petal's area
-_CLEAR = 0.93  # the claw must have less than this part of the surface that the next narrow place of the rim has
+_REACHES = 0.1, 0.15  # radii within which surface around a rim point is counted, in roots of the petal's area
+_TURN_FROM, _TURN_OVER = 0.15, 0.3  # how far from a rim point, and over what length, the rim's direction is taken, in the same
+_CLAW = 0.525  # narrowness of a claw, at most; a straight rim has 1, the corner of a square 0.43, the ends of an ellipse twice as long 0.63
+_CLEAR = 0.85  # the claw must have less than this part of the next narrow place's
 _APART = 0.15  # of the rim's length: two places nearer than this are one
 _CLAW_STATIONS = 0.15, 0.6  # where its widths are taken, in parts of the way from the claw's end to the centre of area
 _CLAW_ROUNDS = 4
@@ -56,7 +59,7 @@ class Petal:
     holes : int
         Borders inside the petal.
     narrowness : float
-        Surface around the base, over that of the next narrow place of the rim; 0 where the base was given.
+        Narrowness (see `narrowness_along`) of the base over that of the next narrow place of the rim; 0 where the base was given.
     """
 
     base: Array
@@ -73,7 +76,7 @@ class Petal:
     narrowness: float
 
 
-def measure_petal(mesh: TriangleMesh, *, name: str = "petal", base: Sequence[float] | None = None) -> Petal:
+def measure_petal(mesh: TriangleMesh, *, name: str = "petal", file: str = "", base: Sequence[float] | None = None) -> Petal:
     """Find base, tip, midrib, frame and inflection of a petal.
 
     Parameters
@@ -82,6 +85,8 @@ def measure_petal(mesh: TriangleMesh, *, name: str = "petal", base: Sequence[flo
         One sheet, scan frame, normals to the inner face's side.
     name : str
         What to call the petal in messages.
+    file : str
+        Its scan, for messages.
     base : sequence of 2 floats, optional, mm
         x and y of the base in the scan frame, where it cannot be recognised; the nearest point of the rim is taken.
 
@@ -90,24 +95,26 @@ def measure_petal(mesh: TriangleMesh, *, name: str = "petal", base: Sequence[flo
     PetalError
         Where the base cannot be told, or the midrib is too broken to fit.
     """
+    where = f"{file} (petal {name})" if file else name
+    hint = f"Give the base by --base {name}=X,Y (mm, scan frame)"
     loops = boundary_loops(mesh.triangles)
     if not loops:
-        raise PetalError("the surface has no rim", file=name, expected="an open sheet")
+        raise PetalError("the surface has no rim", file=where, expected="an open sheet")
     rim = max(loops, key=lambda loop: loop_length(mesh.vertices, loop))
     rim_length = loop_length(mesh.vertices, rim)
     outline = _evenly(mesh.vertices[rim], _RIM_POINTS)
     if base is None:
-        foot, narrowness = _claw(mesh, outline, name)
+        foot, narrowness = _claw(mesh, outline, where, hint)
     else:
-        foot, narrowness = _nearest(outline, base, rim_length, name), 0.0
+        foot, narrowness = _nearest(outline, base, rim_length, where), 0.0
 
     normal = area_vectors(mesh).sum(axis=0)
     normal /= np.linalg.norm(normal)
-    tip = _opposite(mesh, outline, foot, normal, name)
+    tip = _opposite(mesh, outline, foot, normal, where, hint)
     frame = petal_frame(foot, tip, normal)
     length = float(np.linalg.norm(tip - foot))
-    y, z, smooth = _profile(mesh, frame, length, name)
-    where, slope, changes_sign = _inflection(y, smooth)
+    y, z, smooth = _profile(mesh, frame, length, where, hint)
+    place, slope, changes_sign = _inflection(y, smooth)
 
     def to_scan(along: Array, height: Array) -> Array:
         return np.asarray(frame[:3, 3] + np.outer(along, frame[:3, 1]) + np.outer(height, frame[:3, 2]))
@@ -119,7 +126,7 @@ def measure_petal(mesh: TriangleMesh, *, name: str = "petal", base: Sequence[flo
         T_scan_petal=frame,
         midrib=to_scan(y, z),
         profile=np.stack([y, smooth(y)], axis=1),
-        inflection=to_scan(np.array([where]), np.array([float(smooth(where))]))[0],
+        inflection=to_scan(np.array([place]), np.array([float(smooth(place))]))[0],
         direction=direction / np.linalg.norm(direction),
         changes_sign=changes_sign,
         area=area(mesh),
@@ -147,26 +154,57 @@ def _evenly(corners: Array, count: int) -> Array:
     return np.stack([np.interp(at, along, closed[:, axis]) for axis in range(corners.shape[1])], axis=1)
 
 
-def _claw(mesh: TriangleMesh, outline: Array, name: str) -> tuple[Array, float]:
-    """Middle of the narrow end, and how much narrower it is than the next."""
+def narrowness_along(mesh: TriangleMesh, outline: Array) -> Array:
+    """How narrow the petal is at each of evenly spaced points along its rim, shape (n,): 1 on a straight rim, less at a narrow end.
+
+    The product of two measures: surface within reach of the point, over the half disc it is on a straight rim (geometric mean over the
+    reaches); and the angle on the petal's side between the rim before the point and behind it, over 180 deg, mean with 1.
+    """
     from scipy.spatial import cKDTree
 
     weights = vertex_areas(mesh)
-    reach = _REACH * math.sqrt(weights.sum())
-    around = np.array([weights[near].sum() for near in cKDTree(mesh.vertices).query_ball_point(outline, reach)])
+    scale = math.sqrt(weights.sum())
+    tree = cKDTree(mesh.vertices)
+    logs = []
+    for reach in _REACHES:
+        around = np.array([weights[near].sum() for near in tree.query_ball_point(outline, reach * scale)])
+        logs.append(np.log(np.maximum(around, 1e-9) / (math.pi / 2 * (reach * scale) ** 2)))
+    surface = np.exp(np.mean(logs, axis=0))
     # The staircase of the grid makes single points of the rim stick out.
-    around = (np.roll(around, 1) + around + np.roll(around, -1)) / 3
-    count = len(around)
-    narrowest = int(np.argmin(around))
+    surface = (np.roll(surface, 1) + surface + np.roll(surface, -1)) / 3
+    spacing = float(np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1).mean())
+    near, over = (max(1, round(length * scale / spacing)) for length in (_TURN_FROM, _TURN_OVER))
+
+    def chord(first: int, last: int) -> Array:
+        vectors = np.roll(outline, -last, axis=0) - np.roll(outline, -first, axis=0)
+        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+    turn = np.degrees(np.arccos(np.clip((chord(-near - over, -near) * chord(near, near + over)).sum(axis=1), -1, 1)))
+    return np.asarray(surface * (1 - turn / 360))
+
+
+def _claw(mesh: TriangleMesh, outline: Array, where: str, hint: str) -> tuple[Array, float]:
+    """Middle of the narrow end, and how much narrower it is than the next."""
+    narrowness = narrowness_along(mesh, outline)
+    count = len(narrowness)
+    narrowest = int(np.argmin(narrowness))
     steps = np.abs(np.arange(count) - narrowest)
-    elsewhere = around[np.minimum(steps, count - steps) > _APART * count]
-    ratio = float(around[narrowest] / elsewhere.min())
+    elsewhere = narrowness[np.minimum(steps, count - steps) > _APART * count]
+    least = float(narrowness[narrowest])
+    ratio = least / float(elsewhere.min())
+    if least > _CLAW:
+        raise PetalError(
+            f"the base cannot be told: no end is narrow (narrowness {least:.2f})",
+            file=where,
+            expected=f"a claw of at most {_CLAW:.3g}; a straight rim has 1",
+            hint=hint,
+        )
     if ratio > _CLEAR:
         raise PetalError(
-            f"the base cannot be told: the narrowest end has {ratio:.0%} of the surface around it that the next one has",
-            file=name,
+            f"the base cannot be told: the narrowest end has {ratio:.0%} of the narrowness of the next",
+            file=where,
             expected=f"a claw with less than {_CLEAR:.0%}",
-            hint="Give the base by --base X,Y (mm, scan frame)",
+            hint=hint,
         )
     return _claw_middle(mesh, outline, outline[narrowest]), ratio
 
@@ -233,35 +271,35 @@ def _crossed(values: Array) -> tuple[NDArray[np.intp], Array]:
     return before, values[before] / (values[before] - following[before])
 
 
-def _nearest(outline: Array, base: Sequence[float], rim_length: float, name: str) -> Array:
+def _nearest(outline: Array, base: Sequence[float], rim_length: float, where: str) -> Array:
     """Point of the rim nearest to a given one in x and y."""
     wanted = np.asarray(base, dtype=np.float64)
     if wanted.shape != (2,) or not np.isfinite(wanted).all():
-        raise PetalError(f"{base!r} is no place", file=name, expected="x and y in the scan frame, mm")
+        raise PetalError(f"{base!r} is no place", file=where, expected="x and y in the scan frame, mm")
     away = np.hypot(*(outline[:, :2] - wanted).T)
     if away.min() > rim_length / 20:
         nearest = outline[int(np.argmin(away))]
         raise PetalError(
             f"the base given, {wanted[0]:g},{wanted[1]:g}, lies {away.min():.3g} mm from the rim",
-            file=name,
+            file=where,
             expected=f"a place on the rim, e.g. {nearest[0]:.1f},{nearest[1]:.1f}",
             hint="Look at the picture, whose axes are the scan frame's",
         )
     return np.asarray(outline[int(np.argmin(away))])
 
 
-def _opposite(mesh: TriangleMesh, outline: Array, foot: Array, normal: Array, name: str) -> Array:
+def _opposite(mesh: TriangleMesh, outline: Array, foot: Array, normal: Array, where: str, hint: str) -> Array:
     """Where the line from the base through the centre of area last leaves the petal, seen along the mean normal."""
     weights = vertex_areas(mesh)
     along, across, _ = _directions(foot, weights @ mesh.vertices / weights.sum(), normal)
     cut, part = _crossed((outline - foot) @ across)
     if cut.size == 0:
-        raise PetalError("no line from base to tip crosses the petal", file=name, hint="Give the base by --base X,Y (mm, scan frame)")
+        raise PetalError("no line from base to tip crosses the petal", file=where, hint=hint)
     places = (1 - part)[:, None] * outline[cut] + part[:, None] * outline[(cut + 1) % len(outline)]
     return np.asarray(places[int(np.argmax((places - foot) @ along))])
 
 
-def _profile(mesh: TriangleMesh, frame: Array, length: float, name: str) -> tuple[Array, Array, Any]:
+def _profile(mesh: TriangleMesh, frame: Array, length: float, where: str, hint: str) -> tuple[Array, Array, Any]:
     """Section of the petal in the plane of y and z of its frame: y, height, and a smooth spline of height over y."""
     from scipy.interpolate import make_lsq_spline
 
@@ -281,9 +319,9 @@ def _profile(mesh: TriangleMesh, frame: Array, length: float, name: str) -> tupl
     if held.min() < 4:
         raise PetalError(
             "the midrib is broken: the scan has no surface along a part of the line from base to tip",
-            file=name,
+            file=where,
             expected=f"points in every {length / _SPANS:.3g} mm",
-            hint="Scan again, or give the base by --base X,Y (mm, scan frame)",
+            hint=f"Scan again. {hint}",
         )
     return y, z, make_lsq_spline(y, z, knots, k=3)
 

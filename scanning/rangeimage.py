@@ -12,7 +12,7 @@ from scanning.errors import EmptyScanError
 
 Array = NDArray[np.float64]
 
-_SAMPLED = 50  # rows and columns, at least, whose spacing is looked at
+_SAMPLED = 25  # rows and columns, at least, whose spacing is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,8 @@ class RangeImage:
     def __post_init__(self) -> None:
         if self.points.ndim != 3 or self.points.shape[2] != 3 or self.valid.shape != self.points.shape[:2]:
             raise ValueError(f"points {self.points.shape} and valid {self.valid.shape} do not make a grid (H, W, 3) and (H, W)")
-        if not np.isfinite(self.points[self.valid]).all():
+        finite = np.isfinite(self.points)
+        if not (finite[..., 0] & finite[..., 1] & finite[..., 2] | ~self.valid).all():
             raise ValueError("a point that is said to be valid is not finite")
 
     @property
@@ -53,9 +54,13 @@ class RangeImage:
         EmptyScanError
             Where no two neighbours were both measured, or all lie at one place.
         """
-        rows, columns = (slice(None, None, max(1, size // _SAMPLED)) for size in self.shape)
-        across = neighbour_distances(self.points[rows], self.valid[rows], 1)
-        lengths = np.concatenate([across, neighbour_distances(self.points[:, columns], self.valid[:, columns], 0)])
+        lengths = np.empty(0)
+        for sampled in (_SAMPLED, max(self.shape)):
+            rows, columns = (slice(None, None, max(1, size // sampled)) for size in self.shape)
+            across = neighbour_distances(self.points[rows], self.valid[rows], 1)
+            lengths = np.concatenate([across, neighbour_distances(self.points[:, columns], self.valid[:, columns], 0)])
+            if lengths.size >= _SAMPLED:
+                break
         step = float(np.median(lengths)) if lengths.size else 0.0
         if not step > 0:
             raise EmptyScanError(
@@ -69,6 +74,5 @@ class RangeImage:
 def neighbour_distances(points: Array, valid: NDArray[np.bool_], axis: int) -> Array:
     """Distances across the line of sight (in x and y) of valid neighbours along an axis of the grid, mm, shape (n,)."""
     first, second = (slice(None, -1), slice(1, None)) if axis == 0 else ((slice(None), slice(None, -1)), (slice(None), slice(1, None)))
-    both = valid[first] & valid[second]
-    delta = points[second][both][:, :2] - points[first][both][:, :2]
-    return np.asarray(np.hypot(delta[:, 0], delta[:, 1]), dtype=np.float64)
+    apart = np.hypot(points[second][..., 0] - points[first][..., 0], points[second][..., 1] - points[first][..., 1])
+    return np.asarray(apart[valid[first] & valid[second]], dtype=np.float64)

@@ -1,10 +1,14 @@
 """`rig demo`."""
 
+import shutil
 import time
+from pathlib import Path
 
 import click
 
 from rig.cli.fit import fit_run
+from rig.cli.flower import assembly_table, put_together
+from rig.cli.scan import import_petals
 from rig.cli.settings import Settings
 from rig.cli.sweep import run_sweep
 from rig.config import load_config
@@ -12,6 +16,7 @@ from rig.cultivars import TABLE_1
 from rig.errors import ConfigError
 from rig.fits import StoredFit, store_fit
 from rig.measuring import new_order
+from rig.progress import steps
 from rig.runs import Run, new_run_path
 from rig.trajectory import Trajectory, parse_angles
 from rig.units import duration
@@ -20,10 +25,16 @@ ROSE_ASPECT = 1.9
 """Height over width of rose cells, about 20 um wide and a little under 40 um high."""
 
 
-@click.command(epilog="\b\nExample:\n  rig --workspace /tmp/try demo")
+PETALS, OPENING, SEED = 25, 0.6, 1
+SIDE = 800
+"""The virtual rose, and its picture in pixels."""
+
+
+@click.command(epilog="\b\nExamples:\n  rig --workspace /tmp/try demo\n  rig demo --petals 12")
+@click.option("--petals", default=PETALS, show_default=True, type=click.IntRange(5, 45), help="Of the virtual rose.")
 @click.pass_obj
-def command(settings: Settings) -> None:
-    """Measure the four cultivars on the simulated bench, fit, draw, and say where everything lies."""
+def command(settings: Settings, petals: int) -> int:
+    """Measure four cultivars on the simulated bench, fit, scan a virtual rose, put it together, draw, and say where everything lies."""
     started = time.monotonic()
     config = load_config(settings.config)
     if not config.simulated:
@@ -43,8 +54,51 @@ def command(settings: Settings) -> None:
 
     draw_all(fits, settings.workspace.figures)
     click.echo("\n" + closing_table(fits, runs))
-    click.echo(f"\nruns     {settings.workspace.runs}\nfits     {settings.workspace.fits}\nfigures  {settings.workspace.figures}")
+    flower = settings.workspace.flowers / "demo"
+    free = build_rose(flower, petals)
+    picture = picture_rose(flower, fits, settings.workspace.figures)
+    click.echo(f"\nruns     {settings.workspace.runs}\nfits     {settings.workspace.fits}\nflower   {flower}")
+    click.echo(f"figures  {settings.workspace.figures}\npicture  {picture}")
     click.echo(f"all done in {duration(time.monotonic() - started)}")
+    return 0 if free else 1
+
+
+def build_rose(flower: Path, petals: int) -> bool:
+    """Scan a virtual rose petal by petal and put it together from the scans; return whether no two petals intersect."""
+    from sim.rose import write_specimen
+
+    # The folder is the demo's own: what an earlier one left would be mixed with the new petals.
+    shutil.rmtree(flower, ignore_errors=True)
+    scans = flower / "scans"
+    click.echo(f"\na virtual rose of {petals} petals is measured, taken apart and scanned", err=True)
+    write_specimen(scans, petals, OPENING, SEED, meshes=False)
+    import_petals(tuple(map(str, sorted(scans.glob("*.abs")))), str(flower), bases={}, simulated=True)
+    shutil.copy(scans / "placement.toml", flower / "placement.toml")
+    assembly = put_together(flower)
+    click.echo("\n" + assembly_table(assembly))
+    return assembly.state == "free"
+
+
+def picture_rose(flower: Path, fits: dict[str, StoredFit], folder: Path) -> Path:
+    """Draw the flower's figures and take its picture with the reflectance of Rote Rose; return the picture."""
+    from render.images import write_exr, write_png
+    from render.raycast import Raycaster
+    from render.scene import read_flower
+    from rig.flowerfigures import draw_flower
+    from rig.pictures import Shades, frame, marked, show, take
+
+    shades = Shades({})
+    with steps("ray-casting") as progress:
+        progress(0, 2, "figures 11, 13, 14")
+        _, contrasts = draw_flower(flower, fits, folder, simulated=True, shades=shades)
+        progress(1, 2, "the rose")
+        raycaster = Raycaster(read_flower(flower))
+        picture = take(raycaster, frame(raycaster, SIDE, SIDE), shades.of(fits["RR"]), samples=9)
+    click.echo("\n" + contrasts)
+    path = folder / "rose.png"
+    write_png(marked(show(picture, "RR")), path)
+    write_exr(picture, path.with_suffix(".exr"))
+    return path
 
 
 def closing_table(fits: dict[str, StoredFit], runs: dict[str, Run]) -> str:

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rig.cli.view import browser_option, port_option, serve
 from rig.progress import steps
 
 if TYPE_CHECKING:
     from scanning.assemble import Assembly
 
 
-@click.group(epilog="\b\nExamples:\n  rig flower new rose\n  rig flower check rose\n  rig flower assemble rose")
+@click.group(epilog="\b\nExamples:\n  rig flower new rose\n  rig flower check rose\n  rig flower assemble rose\n  rig flower edit rose")
 def command() -> None:
     """Put scanned petals together into a flower."""
 
@@ -61,6 +62,18 @@ def assemble(folder: Path, seed: int, as_json: bool) -> int:
     else:
         click.echo(assembly_table(assembly))
     return 0 if assembly.state == "free" else 1
+
+
+@command.command("edit", epilog="\b\nExamples:\n  rig flower edit rose\n  rig flower edit rose --port 8080 --no-browser")
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@port_option
+@browser_option
+def edit(folder: Path, port: int, no_browser: bool) -> None:
+    """Move and turn petals by hand on a page of this machine, until Ctrl-C; its Save button writes assembly.json."""
+    from rig.flowerpages import edit as open_editor
+
+    page, notes = open_editor(folder, port=port)
+    serve(page, notes, browser=not no_browser, unsaved=lambda: page.unsaved)
 
 
 def put_together(folder: Path, seed: int = 0) -> "Assembly":

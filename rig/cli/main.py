@@ -19,6 +19,7 @@ COMMANDS = {
     "model": ("rig.cli.model", "Evaluate the reflection model itself."),
     "scan": ("rig.cli.scan", "Turn range images of petals into meshes."),
     "flower": ("rig.cli.flower", "Put scanned petals together into a flower."),
+    "view": ("rig.cli.view", "Show a flower in the browser."),
     "render": ("rig.cli.render", "Ray-cast a flower with a fitted reflectance."),
     "figures": ("rig.cli.figures", "Draw the paper's figures from the newest fits."),
     "demo": ("rig.cli.demo", "The whole chain on the simulated bench."),

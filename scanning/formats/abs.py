@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from scanning.errors import EmptyScanError, FormatError
-from scanning.formats.files import content, millimetres, numbers
-from scanning.rangeimage import Array, RangeImage, neighbour_distances
+from scanning.formats.files import content, millimetres, numbers, refuse_absurd, refuse_swapped
+from scanning.rangeimage import RangeImage
 
 NO_POINT = -999999.0
 _HEADER = (
@@ -18,8 +18,6 @@ _HEADER = (
     (rb"\s*pixels\s*\(.*\)\s*:?\s*", "`pixels (flag X Y Z):`"),
 )
 _LINES = ("flags", "X", "Y", "Z")
-# Rows and columns are taken to be swapped when that brings points of one column this many times nearer to each other.
-_NEARER = 3.0
 
 
 def read_abs(path: str | Path, *, unit: str = "mm") -> RangeImage:
@@ -81,36 +79,11 @@ def read_abs(path: str | Path, *, unit: str = "mm") -> RangeImage:
             f"none of the {height * width} points is valid", file=path, line=4, hint="Scan again, nearer or with more light returned"
         )
     points = np.stack(values[1:], axis=-1)
-    broken = np.argwhere(valid[:, None] & (~np.isfinite(points) | (points == NO_POINT)))
-    if len(broken):
-        point, axis = broken[0]
-        raise FormatError(
-            f"point {point} is flagged valid but {_LINES[axis + 1]} is {points[point, axis]:g}", file=path, line=5 + int(axis)
-        )
-    points = np.where(valid[:, None], points * scale, np.nan)
-    _refuse_swapped(points, valid, height, width, path)
+    refuse_absurd(points, valid, scale, path, first_line=5)
+    points[~valid] = np.nan
+    points *= scale
+    refuse_swapped(points, valid, height, width, path, line=1, where="the numbers of lines 1 and 2")
     return RangeImage(points.reshape(height, width, 3), valid.reshape(height, width), str(path))
-
-
-def _refuse_swapped(points: Array, valid: np.ndarray, height: int, width: int, path: str | Path) -> None:
-    """Raise where points of one column lie far apart as the header has it, and near each other with rows and columns swapped."""
-
-    def apart(rows: int, columns: int) -> float:
-        distances = neighbour_distances(points.reshape(rows, columns, 3), valid.reshape(rows, columns), 0)
-        return float(np.median(distances)) if distances.size else np.inf
-
-    if height == width:
-        return
-    said, swapped = apart(height, width), apart(width, height)
-    if np.isfinite(said) and said > _NEARER * swapped:
-        raise FormatError(
-            f"the header says {height} rows and {width} columns, but points below each other are then {said:.3g} mm apart,"
-            f" and {swapped:.3g} mm as {width} rows and {height} columns",
-            file=path,
-            line=1,
-            expected="neighbours on the grid that are neighbours in space",
-            hint="Rows and columns are swapped: exchange the numbers of lines 1 and 2",
-        )
 
 
 def write_abs(path: str | Path, image: RangeImage) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanning.errors import EmptyScanError, FormatError
-from scanning.formats.files import content, millimetres, numbers
+from scanning.formats.files import content, millimetres, numbers, refuse_absurd, refuse_swapped
 from scanning.mesh import TriangleMesh
 from scanning.rangeimage import RangeImage
 
@@ -251,8 +251,10 @@ def read_range_grid(path: str | Path, *, unit: str = "mm") -> RangeImage:
     valid = lengths == 1
     if not valid.any():
         raise EmptyScanError("no point was measured", file=path, hint="Scan again, nearer or with more light returned")
+    refuse_absurd(vertices, np.ones(len(vertices), dtype=bool), scale, path)
     points = np.full((height * width, 3), np.nan)
     points[valid] = vertices[items] * scale
+    refuse_swapped(points, valid, height, width, path, where="the numbers of num_cols and num_rows")
     return RangeImage(points.reshape(height, width, 3), valid.reshape(height, width), str(path))
 
 

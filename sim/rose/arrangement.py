@@ -1,6 +1,7 @@
 """The flower: petals in a spiral about the stem, each moved inwards until it nearly touches those inside it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,9 +13,14 @@ from sim.rose.shape import Form, midrib, sheet
 FEWEST, MOST = 5, 45
 WHORL = 8
 DIVERGENCE = 137.507764  # deg, golden angle
-CLEARANCE = (0.2, 1.0)  # mm, between a petal and the nearest of those inside it; a few petals of large open roses keep up to 1.2
+CLEARANCE = (0.2, 1.0)  # mm, between a petal and the nearest of those inside it
 
-_AIM = (0.24, 0.38)  # mm, clearance aimed at; what is left to CLEARANCE is for the fineness of the search
+_AIM = (0.24, 0.38)  # mm, clearance aimed at
+_SURE = (0.21, 0.96)  # mm, CLEARANCE less what the search's coarse triangles may be off
+_STEM = 1.6  # mm, base radius of the innermost petal; no other comes nearer to the stem
+_STEP = 0.4  # mm of base radius: far below the horizon, so that no sheet is jumped through unseen
+_PACE = 1.25  # mm, no point of a sheet moves further when its base radius changes by 1 mm
+_HORIZON = 3.0  # mm, what is further off is not looked at
 _SEARCH_TRIANGLES = 3000
 _SHIELD = 21  # petals inward beyond these are covered by them; the final check looks at every pair
 
@@ -83,15 +89,9 @@ class Rose:
                     found[one.name, other.name] = count
         return found
 
-    def clearances(self, within: float = 1.5) -> dict[tuple[str, str], float]:
-        """Return the pairs of petals nearer than `within` and their least distance, mm, exact over the full meshes."""
-        found = {}
-        for i, one in enumerate(self.petals):
-            for other in self.petals[i + 1 :]:
-                distance = clearance(one.mesh, other.mesh, within)
-                if distance < within:
-                    found[one.name, other.name] = distance
-        return found
+    def clearances(self) -> dict[str, float]:
+        """Return each petal's least distance to those inside it, mm, 3 if it is more; the innermost has none."""
+        return {petal.name: _least(petal.mesh, [other.mesh for other in self.petals[i:]]) for i, petal in enumerate(self.petals[:-1], 1)}
 
     def covered(self) -> dict[str, float]:
         """Return what share of each petal's outer face other petals cover.
@@ -128,7 +128,7 @@ def grow(petals: int, *, opening: float = 0.5, seed: int = 0, triangles: int = 1
     """Grow a rose.
 
     Petals are sheets around the stem at the golden angle. From the innermost outwards each is moved towards the stem until its least
-    distance to those inside it is 0.24 to 0.38 mm. The finished meshes are then searched for crossing triangles.
+    distance to those inside it is 0.2 to 1.0 mm. The finished meshes are then searched for crossing triangles.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def grow(petals: int, *, opening: float = 0.5, seed: int = 0, triangles: int = 1
     rng = np.random.default_rng([seed, petals, round(opening * 1e6)])
     placed: list[_Layer] = []
     for form, aim in zip(_forms(petals, opening, rng), rng.uniform(*_AIM, petals), strict=True):
-        placed.append(_Layer.of(_settle(form, float(aim), placed[-_SHIELD:])))
+        placed.append(_settle(form, float(aim), placed[-_SHIELD:]))
     forms = [layer.form for layer in placed]
     rose = _named(forms, [sheet(form, triangles) for form in forms], opening, seed)
     if crossed := rose.crossings():
@@ -182,7 +182,7 @@ def _forms(petals: int, opening: float, rng: np.random.Generator) -> list[Form]:
         forms.append(
             Form(
                 azimuth=(start + k * DIVERGENCE + rng.normal(0, 3)) % 360,
-                base_radius=1.6,
+                base_radius=_STEM,
                 base_height=0.0,
                 length=length,
                 half_width=length * rng.uniform(0.46, 0.54),
@@ -204,77 +204,110 @@ def _forms(petals: int, opening: float, rng: np.random.Generator) -> list[Form]:
 
 @dataclass(frozen=True)
 class _Layer:
-    """A petal in its place, ready to be asked how far away others are."""
+    """A petal in a place, ready to be asked how far away others are."""
 
     form: Form
-    vertices: Array
-    outward: Array
-    reach: float
-    tree: object
 
-    @classmethod
-    def of(cls, form: Form) -> "_Layer":
-        from scipy.spatial import cKDTree
+    @cached_property
+    def mesh(self) -> Mesh:
+        return sheet(self.form, _SEARCH_TRIANGLES)
 
-        mesh = sheet(form, _SEARCH_TRIANGLES)
-        corners = mesh.vertices[mesh.faces]
-        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        return cls(form, mesh.vertices, -mesh.vertex_normals(), float(np.median(edges)), cKDTree(mesh.vertices))
+    @cached_property
+    def outward(self) -> Array:
+        return -self.mesh.vertex_normals()
 
-
-def _gap(layer: _Layer, inner: list[_Layer], horizon: float) -> float:
-    """Least distance to the inner layers, negative where this sheet is on the wrong side of one; `horizon` when all are further."""
-    least = horizon
-    for other in inner:
-        distance, index = other.tree.query(layer.vertices, distance_upper_bound=horizon + 1.0)  # type: ignore[attr-defined]
-        near = np.isfinite(distance)
-        if not near.any():
-            continue
-        index = index[near]
-        offset = layer.vertices[near] - other.vertices[index]
-        outward = other.outward[index]
-        along = np.einsum("ij,ij->i", offset, outward)
-        sideways = np.sqrt(np.clip(distance[near] ** 2 - along**2, 0, None))
-        # Beside the rim or on the stem's other side a distance has no sign.
-        facing = (np.einsum("ij,ij->i", layer.outward[near], outward) > 0.2) & (sideways < other.reach)
-        least = min(least, float(np.where(facing, along, distance[near]).min()))
-    return least
+    @cached_property
+    def reach(self) -> float:
+        return float(np.median(self.mesh.edges))
 
 
-def _settle(form: Form, aim: float, inner: list[_Layer]) -> Form:
-    """Find the base radius at which the petal comes within `aim` mm of the inner ones."""
+def _settle(form: Form, aim: float, inner: list[_Layer]) -> _Layer:
+    """Move a petal in until its least distance to the inner ones is in CLEARANCE.
 
-    def at(radius: float) -> Form:
-        return replace(form, base_radius=radius, base_height=3.0 - 0.25 * radius)
+    A search over vertices finds the place outside all of them. It is blind between vertices and too careful beside a rim, so the distance
+    that it leaves is measured over triangles, and put right where it must be.
+    """
+    if not inner:
+        return _Layer(_at(form, _STEM))
+    layer = _outside(form, aim, inner)
+    for _ in range(40):
+        distance = _least(layer.mesh, [other.mesh for other in reversed(inner)])
+        if _SURE[0] <= distance <= _SURE[1]:
+            return layer
+        # Going in, no point moves further than leaves `aim`: nothing is passed through.
+        radius = layer.form.base_radius - (distance - aim) / _PACE
+        if radius < _STEM:
+            break
+        layer = _Layer(_at(form, radius))
+    raise _no_place(form, inner)
+
+
+def _outside(form: Form, aim: float, inner: list[_Layer]) -> _Layer:
+    """Bisect for the least base radius at which the petal is clear of the inner ones and on their outer side."""
 
     def clear(radius: float) -> bool:
-        return _gap(_Layer.of(at(radius)), inner, 2.0) >= aim
+        return _clear(_Layer(_at(form, radius)), aim, inner)
 
-    if not inner:
-        return at(form.base_radius)
-    # Steps far smaller than the gap's horizon cannot jump through a sheet unseen.
-    radius, step = inner[-1].form.base_radius, 0.4
+    radius = inner[-1].form.base_radius
     if clear(radius):
-        while clear(radius - step):
-            radius -= step
-            if radius - step < form.base_radius:
-                return at(radius)
-        low, high = radius - step, radius
+        while clear(radius - _STEP):
+            radius -= _STEP
+            if radius - _STEP < _STEM:
+                return _Layer(_at(form, radius))
+        low, high = radius - _STEP, radius
     else:
         for _ in range(20):
-            radius += step
+            radius += _STEP
             if clear(radius):
                 break
         else:
-            raise RoseError(f"the petal at azimuth {form.azimuth:.0f} deg finds no place outside {len(inner)} others; take another seed")
-        low, high = radius - step, radius
+            raise _no_place(form, inner)
+        low, high = radius - _STEP, radius
     while high - low > 0.015:
         middle = (low + high) / 2
         if clear(middle):
             high = middle
         else:
             low = middle
-    return at(high)
+    return _Layer(_at(form, high))
+
+
+def _at(form: Form, radius: float) -> Form:
+    return replace(form, base_radius=radius, base_height=3.0 - 0.25 * radius)
+
+
+def _no_place(form: Form, inner: list[_Layer]) -> RoseError:
+    return RoseError(
+        f"the petal at azimuth {form.azimuth:.0f} deg finds no place {CLEARANCE[0]} to {CLEARANCE[1]} mm outside {len(inner)} others;"
+        " take another seed"
+    )
+
+
+def _clear(layer: _Layer, aim: float, inner: list[_Layer]) -> bool:
+    """Tell whether a sheet lies on the outer side of all inner ones, with every vertex `aim` mm or more from them."""
+    for other in reversed(inner):
+        distance, index = other.mesh.tree.query(layer.mesh.vertices, distance_upper_bound=_HORIZON)
+        near = np.isfinite(distance)
+        if not near.any():
+            continue
+        index = index[near]
+        offset = layer.mesh.vertices[near] - other.mesh.vertices[index]
+        outward = other.outward[index]
+        along = np.einsum("ij,ij->i", offset, outward)
+        sideways = np.sqrt(np.clip(distance[near] ** 2 - along**2, 0, None))
+        # Beside the rim or on the stem's other side a distance has no sign.
+        facing = (np.einsum("ij,ij->i", layer.outward[near], outward) > 0.2) & (sideways < other.reach)
+        if np.where(facing, along, distance[near]).min() < aim:
+            return False
+    return True
+
+
+def _least(mesh: Mesh, others: list[Mesh]) -> float:
+    """Return the least distance to other meshes, mm, exact: 0 where one is crossed, at most the horizon; the likely nearest first."""
+    least = _HORIZON
+    for other in others:
+        least = min(least, clearance(mesh, other, least))
+    return least
 
 
 def _named(forms: list[Form], meshes: list[Mesh], opening: float, seed: int) -> Rose:

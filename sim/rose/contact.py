@@ -12,7 +12,7 @@ def crossings(a: Mesh, b: Mesh) -> int:
     """Count pairs of triangles, one of each mesh, of which an edge of one meets the other."""
     if not _boxes_meet(a, b, 0.0):
         return 0
-    return int(_kernels()["crossings"](_corners(a), _corners(b), _cell(b)))
+    return int(_kernels()["crossings"](a.corners, b.corners, _cell(b)))
 
 
 def clearance(a: Mesh, b: Mesh, within: float = 5.0) -> float:
@@ -22,11 +22,9 @@ def clearance(a: Mesh, b: Mesh, within: float = 5.0) -> float:
     """
     if not _boxes_meet(a, b, within):
         return float("inf")
-    from scipy.spatial import cKDTree
-
     # Vertices bound the distance from above; triangles nearer than that bound have vertices nearer than the bound and their two edges.
-    edges = _longest_edge(a) + _longest_edge(b)
-    between = cKDTree(b.vertices).query(a.vertices, distance_upper_bound=within + edges)[0]
+    edges = float(a.edges.max() + b.edges.max())
+    between = b.tree.query(a.vertices, distance_upper_bound=within + edges)[0]
     if not np.isfinite(between).any():
         return float("inf")
     if crossings(a, b):
@@ -35,35 +33,24 @@ def clearance(a: Mesh, b: Mesh, within: float = 5.0) -> float:
     to_b = between[a.faces].min(axis=1)
     nearest_first = np.argsort(to_b)
     nearest_first = nearest_first[: np.searchsorted(to_b[nearest_first], bound + edges, side="right")]
-    found = float(_kernels()["clearance"](_corners(Mesh(a.vertices, a.faces[nearest_first])), _corners(b), bound, _cell(b)))
+    found = float(_kernels()["clearance"](a.corners[nearest_first], b.corners, bound, _cell(b)))
     return found if found < within else float("inf")
 
 
 def hits(origins: Array, directions: Array, mesh: Mesh, nearest: float = 1e-6) -> np.ndarray:
     """Tell which rays meet a mesh further along than `nearest` mm; origins and directions (n, 3), result (n,) of bool."""
-    found: np.ndarray = _kernels()["hits"](np.ascontiguousarray(origins), np.ascontiguousarray(directions), _corners(mesh), nearest)
+    found: np.ndarray = _kernels()["hits"](np.ascontiguousarray(origins), np.ascontiguousarray(directions), mesh.corners, nearest)
     return found
 
 
 def _boxes_meet(a: Mesh, b: Mesh, within: float) -> bool:
-    low = np.maximum(a.vertices.min(axis=0), b.vertices.min(axis=0))
-    high = np.minimum(a.vertices.max(axis=0), b.vertices.max(axis=0))
+    low, high = np.maximum(a.box[0], b.box[0]), np.minimum(a.box[1], b.box[1])
     return bool(np.linalg.norm(np.clip(low - high, 0, None)) <= within)
-
-
-def _corners(mesh: Mesh) -> Array:
-    return np.ascontiguousarray(mesh.vertices[mesh.faces])
-
-
-def _longest_edge(mesh: Mesh) -> float:
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return float(max(np.linalg.norm(edge, axis=1).max() for edge in (b - a, c - b, a - c)))
 
 
 def _cell(mesh: Mesh) -> float:
     """Side of the grid's cells, mm: no triangle reaches over more than two of them in any direction."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    return max(float((np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)).max()), 0.25)
+    return max(float(mesh.edges.max()), 0.25)
 
 
 @cache

@@ -1,9 +1,14 @@
 """Triangle mesh of one petal."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 
@@ -22,6 +27,28 @@ class Mesh:
 
     vertices: Array
     faces: NDArray[np.int64]
+
+    @cached_property
+    def corners(self) -> Array:
+        """Corners of each face, mm, shape (m, 3, 3)."""
+        return np.ascontiguousarray(self.vertices[self.faces])
+
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates, mm, each of shape (3,)."""
+        return self.vertices.min(axis=0), self.vertices.max(axis=0)
+
+    @cached_property
+    def edges(self) -> Array:
+        """Lengths of each face's edges, mm, shape (m, 3)."""
+        return np.linalg.norm(self.corners - np.roll(self.corners, 1, axis=1), axis=2)
+
+    @cached_property
+    def tree(self) -> "cKDTree":
+        """Search tree over the vertices."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.vertices)
 
     def moved(self, transform: Array) -> "Mesh":
         """Return the mesh moved by a 4x4 transform, p' = T p."""
@@ -50,7 +77,7 @@ class Mesh:
         return total / np.linalg.norm(total)
 
     def _crossed(self) -> Array:
-        a, b, c = (self.vertices[self.faces[:, corner]] for corner in range(3))
+        a, b, c = self.corners.transpose(1, 0, 2)
         return np.cross(b - a, c - a)
 
 

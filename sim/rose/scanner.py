@@ -136,9 +136,8 @@ def scan(mesh: Mesh, finder: RangeFinder, rng: np.random.Generator) -> Scan:
     """
     from sim.rose.kernels import first_surface, shadowed
 
-    triangles = np.ascontiguousarray(mesh.vertices[mesh.faces])
     step, side = _magnification(mesh, finder)
-    z, face = first_surface(triangles, finder.camera, step, side, side)
+    z, face = first_surface(mesh.corners, finder.camera, step, side, side)
     seen = face >= 0
     x_0, y_0 = np.meshgrid((np.arange(side) - (side - 1) / 2) * step, ((side - 1) / 2 - np.arange(side)) * step)
 
@@ -148,7 +147,7 @@ def scan(mesh: Mesh, finder: RangeFinder, rng: np.random.Generator) -> Scan:
 
     where = on_ray(np.where(seen, z, 0.0))[seen]
     normals = mesh.face_normals()[face[seen]]
-    lit = ~shadowed(where, triangles, finder.laser, 2 * step, 0.05)
+    lit = ~shadowed(where, mesh.corners, finder.laser, 2 * step, 0.05)
     for eye in (finder.camera, finder.laser):
         towards = eye - where
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)

@@ -28,7 +28,7 @@ class Browser:
         Address of everything the page asked for.
     """
 
-    def __init__(self, program: str, profile: Path) -> None:
+    def __init__(self, program: str, profile: Path, *, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
         software_gl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu"]
         quiet = [
             "--no-first-run",
@@ -37,7 +37,7 @@ class Browser:
             "--disable-component-update",
             "--disable-sync",
         ]
-        ours = [f"--window-size={WIDTH},{HEIGHT}", f"--user-data-dir={profile}", "--remote-debugging-port=0"]
+        ours = [f"--window-size={size[0]},{size[1]}", f"--user-data-dir={profile}", "--remote-debugging-port=0"]
         self._process = subprocess.Popen(
             [program, "--headless", "--no-sandbox", "--disable-dev-shm-usage", *software_gl, *quiet, *ours, "about:blank"],
             stderr=subprocess.PIPE,
@@ -53,8 +53,8 @@ class Browser:
         self.requested: list[str] = []
         target = next(each for each in self.ask("Target.getTargets")["targetInfos"] if each["type"] == "page")
         self._session = self.ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)["sessionId"]
-        size = {"width": WIDTH, "height": HEIGHT, "deviceScaleFactor": 1, "mobile": False}
-        self.ask("Emulation.setDeviceMetricsOverride", **size)
+        shown = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+        self.ask("Emulation.setDeviceMetricsOverride", **shown)
         self.ask("Network.enable")
         self.ask("Page.enable")
 
@@ -119,13 +119,29 @@ class Browser:
 
     def drag(self, *points: tuple[float, float]) -> None:
         """Press the left button at the first point, move through the others, and let go at the last."""
-        self._mouse("mouseMoved", points[0], buttons=0)
+        self.hover(points[0])
         self.frames(5)  # what lies under the pointer is looked for while drawing
-        self._mouse("mousePressed", points[0], button="left", clickCount=1)
+        self.press(points[0])
         for point in points[1:]:
-            self._mouse("mouseMoved", point, button="left")
-            self.frames(1)
-        self._mouse("mouseReleased", points[-1], button="left", clickCount=1)
+            self.pull(point)
+        self.release(points[-1])
+
+    def hover(self, point: tuple[float, float]) -> None:
+        """Bring the pointer to a point, no button pressed."""
+        self._mouse("mouseMoved", point, buttons=0)
+
+    def press(self, point: tuple[float, float]) -> None:
+        """Press the left button."""
+        self._mouse("mousePressed", point, button="left", clickCount=1)
+
+    def pull(self, point: tuple[float, float]) -> None:
+        """Bring the pointer to a point with the left button pressed, and let the page draw that."""
+        self._mouse("mouseMoved", point, button="left")
+        self.frames(1)
+
+    def release(self, point: tuple[float, float]) -> None:
+        """Let go of the left button."""
+        self._mouse("mouseReleased", point, button="left", clickCount=1)
 
     def key(self, key: str, code: int) -> None:
         """Press and release a named key, e.g. ``ArrowRight``; `code` is its Windows virtual key code."""

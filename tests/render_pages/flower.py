@@ -29,6 +29,14 @@ class Flower:
         T[:3, 3] = 4 * out + 3 * up
         return T @ self.T_petal_scan[name]
 
+    def turned(self, name: str, T_flower_scan: Matrix, stem_angle: float, azimuth: float) -> Matrix:
+        """Bend a petal about its base and bring it round the stem, wherever it lies."""
+        old_stem, old_azimuth = self.angles(name, T_flower_scan)
+        placed, bent = (self.pose(name, stem, old_azimuth) for stem in (old_stem, stem_angle))
+        # Bending is a motion in the petal's own frame, so on the right; going round is one in the flower's frame, on the left.
+        lying = T_flower_scan @ np.linalg.inv(placed) @ bent
+        return self.pose(name, stem_angle, azimuth) @ np.linalg.inv(bent) @ lying
+
     def angles(self, name: str, T_flower_scan: Matrix) -> tuple[float, float]:
         """Measure stem angle and azimuth of a petal that lies somewhere."""
         y = T_flower_scan[:3, :3] @ np.linalg.inv(self.T_petal_scan[name])[:3, 1]

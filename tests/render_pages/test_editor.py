@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from render.editor import COLLIDING, Checks, Editor, Poses, serve_editor
+from render.editor import Checks, Editor, Poses, serve_editor
 from render.errors import RenderError
-from render.viewer import serve_viewer
+from render.viewer import COLLIDING, serve_viewer
 from tests.render_pages.flower import Flower, Matrix, flower
 
 pytest.importorskip("viser", reason="the optional package viser is not installed")
@@ -38,7 +38,7 @@ def edit(petals: Flower) -> Iterator[Open]:
     opened: list[Editor] = []
 
     def open_page(**changes: Any) -> Editor:
-        asked = {"bases": petals.bases, "angles": petals.angles, "pose": petals.pose, "collisions": petals.close_neighbours}
+        asked = {"bases": petals.bases, "angles": petals.angles, "turned": petals.turned, "collisions": petals.close_neighbours}
         page = serve_editor(petals.petals, **asked | {"save": lambda poses: "assembly.json"} | changes)
         opened.append(page)
         return page
@@ -98,7 +98,7 @@ LONE = flower({"P01": (40.0, 10.0)})
 @pytest.fixture(scope="module")
 def lone_page() -> Iterator[Editor]:
     nothing = {"collisions": lambda poses: (), "save": lambda poses: None}
-    with serve_editor(LONE.petals, bases=LONE.bases, angles=LONE.angles, pose=LONE.pose, **nothing) as page:
+    with serve_editor(LONE.petals, bases=LONE.bases, angles=LONE.angles, turned=LONE.turned, **nothing) as page:
         yield page
 
 

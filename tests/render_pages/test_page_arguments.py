@@ -20,7 +20,7 @@ def edit(**changes: Any) -> Page:
     asked = {
         "bases": PETALS.bases,
         "angles": PETALS.angles,
-        "pose": PETALS.pose,
+        "turned": PETALS.turned,
         "collisions": lambda poses: set(),
         "save": lambda poses: None,
     }
@@ -75,7 +75,7 @@ def test_the_editor_needs_every_base_and_a_rigid_pose() -> None:
     with pytest.raises(RenderError, match="P02: expected its base"):
         edit(bases=PETALS.bases | {"P02": [1.0, 2.0]})
     with pytest.raises(RenderError, match="P01: the transform is no rotation"):
-        edit(pose=lambda name, stem_angle, azimuth: MIRROR)
+        edit(turned=lambda name, T, stem_angle, azimuth: MIRROR)
 
 
 def test_bounds_enclose_the_flower_closely() -> None:
@@ -92,3 +92,9 @@ def test_neighbouring_petals_differ_in_shade() -> None:
     colours = list(petal_colours(many).values())
     assert all(sum(abs(x - y) for x, y in zip(a, b, strict=True)) > 20 for a, b in itertools.pairwise(colours))
     assert all(0 <= part <= 255 for colour in colours for part in colour)
+
+
+def test_a_hue_is_linear_and_colours_every_petal() -> None:
+    (only,) = petal_colours(checked({"P01": GOOD}), (1.0, 0.2140, 0.0)).values()  # half of sRGB's range is 0.2140 linear
+    assert only[1] / only[0] == pytest.approx(0.5, abs=0.01)
+    assert only[2] == 0

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rig.flowerpages import Saving, open_flower
 from tests.conftest import ROOT, rig_environment
 
 pytestmark = pytest.mark.slow
@@ -49,6 +50,14 @@ def test_from_scans_to_a_picture(rig, rose: Path, tmp_path: Path) -> None:
         turn = np.degrees(np.arccos(np.clip((np.trace(moved[:3, :3]) - 1) / 2, -1, 1)))
         assert turn < 15  # angles were measured to 3 deg, and roll not at all
 
+    # By hand: what the editor's page saves is a flower like any other.
+    by_hand = open_flower(tmp_path / "flower")
+    bent = by_hand.turned("P01", by_hand.start["P01"], 60.0, by_hand.angles("P01", by_hand.start["P01"])[1])
+    Saving(by_hand)(by_hand.start | {"P01": bent})
+    kept = json.loads((tmp_path / "flower" / "assembly.json").read_text())
+    assert kept["petals"]["P01"]["stem_angle"] == pytest.approx(60.0)
+    assert kept["by_hand"]["saves"][0]["moved"] == ["P01"]
+
     (tmp_path / "t.csv").write_text("theta_i,theta_r,value\n" + "".join(f"45,{t},{20 + 10 * (t > 0)}\n" for t in range(-60, 61, 20)))
     fit = json.loads(rig("fit", "t.csv", "--json").stdout)["id"]
     rig("render", "flower", "--fit", fit, "--size", "120x100", "--samples", "1", "--out", "p.png", timeout=120)
@@ -58,6 +67,13 @@ def test_from_scans_to_a_picture(rig, rose: Path, tmp_path: Path) -> None:
     assert picture.shape == (100, 120, 3)
     assert (picture.sum(axis=2) > 60).mean() > 0.1
     assert (tmp_path / "p.exr").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("command", [("flower", "edit"), ("view",)])
+def test_pages_have_help_with_examples(rig, command: tuple[str, ...]) -> None:
+    said = rig(*command, "--help").stdout
+    assert re.search(r"Examples:\n +rig ", said)
+    assert {"--port", "--no-browser"} <= set(re.findall(r"--[a-z-]+", said))
 
 
 def test_a_scan_cut_off_is_named_with_its_line(rig, rose: Path, tmp_path: Path) -> None:

@@ -1,14 +1,22 @@
 """Base, tip, frame and inflection of petals whose shape is known."""
 
+import json
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from scanning.clean import clean
 from scanning.errors import PetalError
-from scanning.mesh import TriangleMesh
-from scanning.petal import Petal, measure_petal
+from scanning.formats import read_range_image
+from scanning.formats.ply import read_mesh
+from scanning.mesh import TriangleMesh, boundary_loops
+from scanning.petal import Petal, measure_petal, narrowness_along
 from scanning.rangeimage import RangeImage
 from scanning.triangulate import triangulate
+from sim.rose import write_specimen
 from tests.scanning.surfaces import BEND, INFLECTION, PETAL_LENGTH, petal_inside, petal_point, petal_scan, scan, turned
 
 
@@ -91,9 +99,81 @@ def ellipse() -> TriangleMesh:
     return surface(scan(lambda x, y: 0.01 * x**2, lambda x, y: (x / 10) ** 2 + (y / 18) ** 2 < 1))
 
 
-def test_two_ends_alike_are_not_guessed() -> None:
-    with pytest.raises(PetalError, match=r"P07.*--base X,Y"):
-        measure_petal(ellipse(), name="P07")
+def ragged(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A round piece with a torn rim."""
+    rng = np.random.default_rng(4)
+    angle = np.arctan2(y, x)
+    waves = sum(rng.normal(0, 0.12 / np.sqrt(n)) * np.cos(n * angle + rng.uniform(0, 7)) for n in range(2, 25))
+    return np.asarray(np.hypot(x, y) < 14 * (1 + waves))
+
+
+NO_PETALS = {
+    "disc": lambda x, y: np.hypot(x, y) < 16,
+    "square": lambda x, y: (np.abs(x) < 14) & (np.abs(y) < 14),
+    "turned square": lambda x, y: np.abs(x) + np.abs(y) < 19,
+    "half disc": lambda x, y: (np.hypot(x, y) < 20) & (y > 0),
+    "ellipse": lambda x, y: (x / 10) ** 2 + (y / 18) ** 2 < 1,
+    "strip": lambda x, y: (np.abs(x) < 4) & (np.abs(y) < 25),
+    "ragged": ragged,
+}
+
+
+@pytest.mark.parametrize("shape", NO_PETALS)
+@pytest.mark.parametrize("noise", [0.0, 0.08])
+def test_what_has_no_claw_is_not_guessed(shape: str, noise: float) -> None:
+    mesh = surface(scan(lambda x, y: 0.01 * x**2, NO_PETALS[shape], noise=noise, quantum=4 * noise))
+    with pytest.raises(PetalError, match=r"^P07: the base cannot be told.*--base P07=X,Y"):
+        measure_petal(mesh, name="P07")
+
+
+def test_the_scan_is_named_with_the_petal() -> None:
+    with pytest.raises(PetalError, match=r"^scans/P07\.abs \(petal P07\): .*--base P07=X,Y"):
+        measure_petal(ellipse(), name="P07", file="scans/P07.abs")
+
+
+def test_narrowness_of_known_ends() -> None:
+    def least_and_most(inside: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[float, float]:
+        mesh = surface(scan(lambda x, y: 0.0 * x, inside))
+        rim = mesh.vertices[boundary_loops(mesh.triangles)[0]]
+        along = np.arange(0, len(rim), len(rim) / 240).astype(int)
+        values = narrowness_along(mesh, rim[along])
+        return float(values.min()), float(values.max())
+
+    # A straight rim has 1; a quarter disc within a right angle half of that, times 1 - 90 / 360.
+    least, most = least_and_most(NO_PETALS["square"])
+    assert least == pytest.approx(0.5 * 0.75, rel=0.25)
+    assert most == pytest.approx(1, abs=0.06)
+
+
+@pytest.fixture(scope="module", params=[(12, 1, 0.0), (12, 5, 1.0)], ids=str)
+def rose(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A virtual rose, scanned."""
+    petals, seed, opening = request.param
+    folder = tmp_path_factory.mktemp("rose")
+    write_specimen(folder, petals, opening, seed, triangles=5000)
+    return folder
+
+
+@pytest.mark.slow
+def test_every_petal_of_a_rose_is_known_by_its_claw(rose: Path) -> None:
+    truth = json.loads((rose / "truth.json").read_text())["petals"]
+    assert len(truth) >= 12
+    for name, petal in truth.items():
+        mesh = surface(read_range_image(rose / f"{name}.abs"))
+        found = measure_petal(mesh, name=name)
+        assert np.linalg.norm(found.base - petal["base"]) < 1.0, name
+        assert found.narrowness < 0.84, name
+        # The rim is met, and the surface smooth.
+        true = read_mesh(rose / f"{name}.ply")
+        border = true.vertices[boundary_loops(true.triangles)[0]]
+        rim = mesh.vertices[boundary_loops(mesh.triangles)[0]]
+        assert np.median(cKDTree(finely(border)).query(rim)[0]) < petal["step"], name
+
+
+def finely(loop: np.ndarray) -> np.ndarray:
+    """Points along a closed line, fifty for each of its sides."""
+    part = np.arange(50)[:, None, None] / 50
+    return np.asarray(((1 - part) * loop + part * np.roll(loop, -1, axis=0)).reshape(-1, 3))
 
 
 def test_a_base_can_be_given() -> None:

@@ -72,15 +72,35 @@ def test_abs_round_trip(tmp_path: Path, height: int, width: int, seed: int) -> N
     np.testing.assert_array_equal(back.points[valid], points[valid])
 
 
-def test_swapped_rows_and_columns_are_seen(tmp_path: Path) -> None:
-    rows, columns = np.mgrid[:30, :40]
-    write_abs(tmp_path / "a.abs", RangeImage(np.stack([columns, -rows, 0.0 * rows], axis=-1) * 0.35, np.ones((30, 40), dtype=bool)))
+def sheet(height: int, width: int, filled: float = 1.0) -> RangeImage:
+    """A tilted sheet on a grid of 0.35 mm, round where it does not fill the grid."""
+    rows, columns = np.mgrid[:height, :width]
+    valid = np.hypot(rows / height - 0.5, columns / width - 0.5) < filled
+    points = np.stack([columns, -rows, 0.2 * rows], axis=-1) * 0.35
+    return RangeImage(np.where(valid[..., None], points, np.nan), valid)
+
+
+@pytest.mark.parametrize("filled", [1.0, 0.3])
+@pytest.mark.parametrize(("height", "width"), [(30, 40), (40, 30), (50, 100), (100, 50), (41, 40), (100, 25)])
+def test_swapped_rows_and_columns_are_seen(tmp_path: Path, height: int, width: int, filled: float) -> None:
+    image = sheet(height, width, filled)
+    write_abs(tmp_path / "a.abs", image)
+    assert read_abs(tmp_path / "a.abs").shape == (height, width)
     text = (tmp_path / "a.abs").read_text()
-    (tmp_path / "a.abs").write_text(text.replace("30 rows\n40 columns", "40 rows\n30 columns"))
-    with pytest.raises(FormatError, match="swapped") as caught:
+    (tmp_path / "a.abs").write_text(text.replace(f"{height} rows\n{width} columns", f"{width} rows\n{height} columns"))
+    with pytest.raises(FormatError, match="rows and columns seem swapped") as caught:
         read_abs(tmp_path / "a.abs")
     assert caught.value.line == 1
-    assert "40 rows and 30 columns" in str(caught.value)
+    assert f"{width} rows and {height} columns" in str(caught.value)
+
+    number = np.where(image.valid, np.cumsum(image.valid).reshape(height, width) - 1, -1).tolist()
+    whole = ply_grid("binary_little_endian", image.points[image.valid], number)
+    (tmp_path / "a.ply").write_bytes(whole)
+    assert read_range_grid(tmp_path / "a.ply").shape == (height, width)
+    swapped = whole.replace(b"num_cols %d" % width, b"num_cols %d" % height).replace(b"num_rows %d" % height, b"num_rows %d" % width)
+    (tmp_path / "a.ply").write_bytes(swapped)
+    with pytest.raises(FormatError, match=r"a\.ply: rows and columns seem swapped.*num_cols"):
+        read_range_grid(tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize(
@@ -93,6 +113,12 @@ def test_swapped_rows_and_columns_are_seen(tmp_path: Path) -> None:
         (b"1 1 0 1 1 1", b"1 1 0 2 1 1", 4, "flag 2"),
         (b"-9.25", b"-999999.000000", 7, "point 1"),
         (b"-9.25", b"nan", 7, "point 1"),
+        (b"-9.25", b"inf", 7, "point 1"),
+        (b"-9.25", b"1e400", 7, "point 1"),
+        (b"-9.25", b"-9e25", 7, "-9e+25"),
+        (b"2 rows", b"0 rows", 1, "0 rows"),
+        (b"2 rows", b"999999999 rows", 4, "6 values of flags"),
+        (b"-9.25", b"9" * 500, 7, "inf"),
         (b"-9 -9.25 -999999.000000 -9 -9 -9\n", b"", 6, "3 lines of values"),
         (b"1 1 0 1 1 1", b"0 0 0 0 0 0", 4, "none of the 6 points"),
         (b"pixels (flag X Y Z):", b"", 3, "pixels"),

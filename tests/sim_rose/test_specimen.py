@@ -87,7 +87,8 @@ def test_the_true_transforms_put_the_scans_onto_the_flower(folder: Path) -> None
 def test_the_placement_is_the_truth_within_its_errors(folder: Path) -> None:
     placement = tomllib.loads((folder / "placement.toml").read_text(encoding="utf-8"))
     truth = json.loads((folder / "truth.json").read_text())["petals"]
-    assert placement["flower"]["name"]
+    assert set(placement) == {"flower", "petals"}
+    assert set(placement["flower"]) == {"name"}
     assert sorted(placement["petals"]) == sorted(truth)
     for name, measured in placement["petals"].items():
         assert measured["left"] == truth[name]["left"]
