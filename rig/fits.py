@@ -22,6 +22,8 @@ SCHEMA_VERSION = 1
 NANO = 1e-9
 ANGLE_DIGITS = 3
 """Readbacks are fitted to a thousandth of a degree: below what the arms resolve."""
+ROSE_ASPECT = 1.9
+"""Height over width of rose cells, about 20 um wide and a little under 40 um high."""
 
 
 def measurements_of(run: Run) -> "Measurements":
@@ -101,6 +103,27 @@ class StoredFit:
 def new_fit(label: str, simulated: bool, provenance: dict[str, Any], fit: "MixtureFit") -> StoredFit:
     """Return `fit` with a name of its own."""
     return StoredFit(f"{time.strftime('%Y-%m-%d')}_{label}_{uuid.uuid4().hex[:8]}", time.time(), label, simulated, provenance, fit)
+
+
+def refitted(stored: StoredFit, aspect: float) -> StoredFit:
+    """Return the same readings fitted with cells of another shape, not stored; readings weighted by sigma are weighted relatively."""
+    import numpy as np
+
+    from fitting.measurements import Measurements
+    from fitting.mixture import fit_mixture
+
+    old = stored.fit
+    readings = Measurements(
+        theta_i_deg=np.asarray(old.theta_i_deg),
+        theta_r_deg=np.asarray(old.theta_r_deg),
+        value=np.asarray(old.measured),
+        quantity="intensity",
+        unit=old.unit,
+        source=old.source,
+        rows=np.asarray(old.rows),
+    )
+    fit = fit_mixture(readings, aspect=aspect, weights="plain" if old.weights == "plain" else "relative")
+    return new_fit(stored.label, stored.simulated, stored.provenance, fit)
 
 
 def provenance_of_run(run: Run) -> dict[str, Any]:

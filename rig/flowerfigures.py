@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rig.contrasts import compare, contrast_table
 from rig.figures import saved_figure
 from rig.pictures import Shades, frame, show, take
 
@@ -35,8 +36,6 @@ def draw_flower(
         Reflectance tables that exist already.
     """
     from render.camera import Box
-    from render.contrast import measure_contrast
-    from render.errors import RenderError
     from render.images import boxed
     from render.raycast import Raycaster
     from render.scene import read_flower, read_mesh
@@ -51,30 +50,19 @@ def draw_flower(
         first = sorted(flower.glob("petals/*/mesh.ply"))[0]
         _polygons(figure, read_mesh(first), first.parent.name)
 
-    whole = show(take(raycaster, camera, shades.of(fits["RR"])), "RR")
+    picture = take(raycaster, camera, shades.of(fits["RR"]))
+    whole = show(picture, "RR")
     side = round(SIDE * DETAIL)
-    box = Box(*_brightest(whole, side), side, side)
+    box = Box(*_brightest(picture.radiance, side), side, side)
     detail = show(take(raycaster, camera.detail(box, enlarge=SIDE / side), shades.of(fits["RR"])), "RR")
     with saved_figure((9, 4.8), [written[1]], simulated=simulated) as figure:
         _images(figure, {"RR": boxed(whole, box), f"detail, {SIDE / side:.1f} times": detail})
 
-    images, rows = {}, []
-    for name, fit in fits.items():
-        picture = take(raycaster, camera, shades.of(fit))
-        measured = dict(zip(map(round, fit.fit.theta_r_deg), fit.fit.measured, strict=True))
-        ratio = measured[40] / measured[-40]
-        try:
-            contrast = measure_contrast(picture)
-            told = f"{contrast.C:.2f}"
-            rows.append(f"{name:<4}{contrast.C:>8.3f}{contrast.facing_pixels:>10}{contrast.mirroring_pixels:>11}{ratio:>15.2f}")
-        except RenderError as exc:
-            told = "?"
-            rows.append(f"{name:<4}{'?':>8}   {exc}")
-        images[f"{name}: C {told}, I(+40)/I(-40) {ratio:.2f}"] = show(picture, name)
+    pictures, rows, matt = compare(raycaster, camera, fits, shades)
+    images = {f"{r.label}: C {r.C:.2f}, I(+40)/I(-40) {r.measured:.2f}": show(pictures[r.label], r.label) for r in rows}
     with saved_figure((9, 9.4), [written[2]], simulated=simulated) as figure:
         _images(figure, images)
-    header = f"{'':<4}{'C':>8}{'facing px':>10}{'mirror px':>11}{'I(+40)/I(-40)':>15}"
-    return written, "\n".join([header, *rows])
+    return written, contrast_table(rows, matt)
 
 
 def _polygons(figure: Any, mesh: Any, name: str) -> None:
@@ -102,9 +90,9 @@ def _square(middle: Any, half: float) -> Any:
     return Rectangle(middle - half, 2 * half, 2 * half, fill=False, color="#D55E00", linewidth=1.2)
 
 
-def _brightest(image: Any, side: int) -> tuple[int, int]:
+def _brightest(radiance: Any, side: int) -> tuple[int, int]:
     """Return left and top of the square of `side` pixels that has most light in it."""
-    light = image.sum(axis=-1, dtype=float).cumsum(axis=0).cumsum(axis=1)
+    light = radiance.cumsum(axis=0, dtype=float).cumsum(axis=1)
     total = np.pad(light, ((1, 0), (1, 0)))
     sums = total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side]
     top, left = np.unravel_index(int(np.argmax(sums)), sums.shape)

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Poses = dict[str, Array]
 
-UPRIGHT = 1e-9  # horizontal part of a midrib's direction, below which it points nowhere
 LOOKED_AT = 500  # vertices of each petal, to tell which of two is inside
 
 
@@ -99,41 +98,26 @@ class HandFlower:
 
     def assembly(self, poses: Poses) -> "Assembly":
         """Return the flower as it lies: whether petals intersect, clearance, residuals and conflicts, all found anew."""
-        from scanning.assemble import Assembly
-        from scanning.contact import clearance, crossings
+        from scanning.assemble import judge
         from scanning.terms import measured
 
         names, petals = self.names, list(self.petals.values())
         sheets, placed = [petal.sheet for petal in petals], self._stacked(poses)
-        q = np.array([self._coordinates(name, poses[name]) for name in names])
-        angles = np.array([self.angles(name, poses[name]) for name in names])
-        residuals = measured(self.placement, names, np.array([petal.inflection for petal in petals]), self.habit).residuals(q)
-        with self._one_at_a_time:
-            pierced = crossings(sheets, placed)
-            gap = 0.0 if pierced else clearance(sheets, placed)
-            outside = self._contrary(placed)
+        m = measured(self.placement, names, np.array([petal.inflection for petal in petals]), self.habit)
         stated = self.placement.inside_of()
         known = {(str(a), str(b)) for a, b in self.table.get("inside", [])} if self.table else set()
-        crossing = sorted({(names[min(pair)], names[max(pair)]) for pair in pierced})
-        return Assembly(
-            names=names,
-            state="intersecting" if pierced else "free",
-            poses=placed,
-            start=self._stacked(_as_measured(petals, self.placement, self.habit)),
-            clearance=gap,
-            stem_angle=angles[:, 0],
-            azimuth=angles[:, 1],
-            residuals=residuals,
-            pairs=sorted((known | set(stated)) - outside),
-            intersecting=crossing,
-            conflicts=_conflicts(names, q, residuals, self.habit, crossing) + _on_wrong_sides([pair for pair in stated if pair in outside]),
-            habit=self.habit,
-            seed=int(self.table.get("seed", 0)) if self.table else 0,
-            seconds=float(self.table.get("seconds", 0.0)) if self.table else 0.0,
-        )
+        ran = {key: self.table[key] for key in ("seed", "seconds") if key in self.table} if self.table else {}
+        q = np.array([self._coordinates(name, poses[name]) for name in names])
+        with self._one_at_a_time:
+            outside = self._contrary(placed)
+            pairs = [(names.index(a), names.index(b)) for a, b in (known | set(stated)) - outside]
+            found = judge(names, sheets, q, placed, m, pairs, habit=self.habit, **ran)
+        return replace(found, conflicts=found.conflicts + _on_wrong_sides([pair for pair in stated if pair in outside]))
 
     def _coordinates(self, name: str, T_flower_scan: Array) -> Array:
-        return coordinates(T_flower_scan @ self.petals[name].T_scan_petal)
+        from scanning.poses import coordinates
+
+        return coordinates((T_flower_scan @ self.petals[name].T_scan_petal)[None])[0]
 
     def _stacked(self, poses: Poses) -> Array:
         return np.array([poses[name] for name in self.names])
@@ -165,30 +149,6 @@ class HandFlower:
         np.add.at(total, (seen.i, seen.j), seen.height)
         inside = total - total.T
         return {(self.names[i], self.names[j]) for i, j in zip(*np.nonzero(inside < 0), strict=True)}
-
-
-def coordinates(T_flower_petal: Array) -> Array:
-    """Return the coordinates q (6,) of a petal's pose (4, 4), so that `scanning.poses.petal_poses` gives it back; rad and mm.
-
-    Of the two ways to write a pose, leaning out or, turned half round, in, the one with less roll. A petal upright to the last digit
-    has no roll.
-    """
-    from scanning.poses import AZIMUTH, HEIGHT, RADIUS, ROLL, SIDE, TILT
-
-    x, midrib, base = T_flower_petal[:3, 0], T_flower_petal[:3, 1], T_flower_petal[:3, 3]
-    level = math.hypot(midrib[0], midrib[1])
-    found = []
-    for way in (1.0, -1.0):
-        q = np.zeros(6)
-        q[TILT] = way * math.atan2(level, midrib[2])
-        q[AZIMUTH] = math.atan2(way * midrib[1], way * midrib[0]) if level > UPRIGHT else math.atan2(x[0], -x[1])
-        cos, sin = math.cos(q[AZIMUTH]), math.sin(q[AZIMUTH])
-        tangent = np.array([-sin, cos, 0.0])
-        inner = np.array([-math.cos(q[TILT]) * cos, -math.cos(q[TILT]) * sin, math.sin(q[TILT])])
-        q[RADIUS], q[SIDE], q[HEIGHT] = base[0] * cos + base[1] * sin, base @ tangent, base[2]
-        q[ROLL] = math.atan2(-float(x @ inner), -float(x @ tangent))
-        found.append(q)
-    return min(found, key=lambda q: abs(float(q[ROLL])))
 
 
 def open_flower(folder: Path) -> HandFlower:
@@ -341,25 +301,6 @@ def told_state(table: Mapping[str, Any]) -> str:
         return "no two petals intersect" + (f", clearance {clearance:.3f} mm" if clearance is not None else "")
     pairs = ", ".join("-".join(pair) for pair in table.get("intersecting", []))
     return f"INTERSECTING: {pairs or 'which petals is not told'}"
-
-
-def _conflicts(names: list[str], q: Array, residuals: Array, habit: "Habit", crossing: list[tuple[str, str]]) -> list[str]:
-    from scanning.assemble import CONFLICT
-    from scanning.terms import ASSUMED, MEASUREMENTS, on_receptacle
-
-    out = [
-        f"{name}: {what} is {pull:+.1f} standard uncertainties from what was {'assumed' if what in ASSUMED else 'measured'}"
-        for name, row in zip(names, residuals, strict=True)
-        for what, pull in zip(MEASUREMENTS, row, strict=True)
-        if abs(pull) > CONFLICT
-    ]
-    lifts = on_receptacle(q, habit.receptacle_u).residual[: len(names)]  # the last row is no petal's
-    out += [
-        f"{name}: its base lies {lift:+.1f} standard uncertainties off the receptacle"
-        for name, lift in zip(names, lifts, strict=True)
-        if abs(lift) > CONFLICT
-    ]
-    return out + [f"{a} and {b} intersect as they were put by hand" for a, b in crossing]
 
 
 def _on_wrong_sides(pairs: list[tuple[str, str]]) -> list[str]:

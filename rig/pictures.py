@@ -12,12 +12,15 @@ if TYPE_CHECKING:
     from fitting.table import Reflectance, ReflectanceTable
     from render.camera import Camera
     from render.light import Light
-    from render.raycast import Picture, Raycaster
+    from render.raycast import Picture, Raycaster, Shading
 
 COLOURS = {"BR": (0.42, 0.02, 0.06), "RR": (0.85, 0.04, 0.06), "PR": (0.98, 0.55, 0.66), "WR": (0.98, 0.97, 0.90)}
 """Hues to show the cultivars in: the model has no colour yet, so these are for the eye only."""
 
-ABOVE = (0.55, -0.75, 0.75)
+BACKGROUND = 0.2
+"""Linear grey behind the flower: on black, its own shadows would have no outline."""
+
+ABOVE = (0.4, -0.6, 0.85)
 """From where the flower is seen by default: from the front, a good way above its horizon."""
 
 
@@ -74,7 +77,7 @@ def frame(raycaster: "Raycaster", width: int, height: int, towards: tuple[float,
     return Camera.framing(raycaster.scene.vertices, towards, width=width, height=height)
 
 
-def take(raycaster: "Raycaster", camera: "Camera", shade: "Reflectance", *, light: "Light | None" = None, samples: int = 4) -> "Picture":
+def take(raycaster: "Raycaster", camera: "Camera", shade: "Shading", *, light: "Light | None" = None, samples: int = 4) -> "Picture":
     """Take a picture, lit as the paper's are unless `light` says otherwise."""
     return raycaster.picture(camera, shade, light=light, samples=samples)
 
@@ -83,4 +86,4 @@ def show(picture: "Picture", label: str) -> Any:
     """Return the picture as 8-bit sRGB in the cultivar's hue, exposed for itself."""
     from render.images import develop, exposure
 
-    return develop(picture, exposure(picture), colour=COLOURS.get(label, (1.0, 1.0, 1.0)))
+    return develop(picture, exposure(picture), colour=COLOURS.get(label, (1.0, 1.0, 1.0)), background=BACKGROUND)

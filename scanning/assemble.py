@@ -199,7 +199,6 @@ def assemble(
     m = measured(placement, names, inflection, habit)
     to_petal = np.array([inverse(pose) for pose in T_scan_petal])
     q = m.start()
-    start = petal_poses(q) @ to_petal
     chosen = [samples(sheet, points, rng) for sheet in sheets]
     number = {name: index for index, name in enumerate(names)}
     stated = [(number[a], number[b]) for a, b in placement.inside_of() if a in number and b in number]
@@ -259,26 +258,52 @@ def assemble(
         if not pierced:
             break
         caps = 1.0
-    q, poses = best, petal_poses(best) @ to_petal
+    tell("done", 1.0)
+    pairs = [(i, j) if i_inside else (j, i) for (i, j), i_inside in inside.items()]
+    return judge(names, sheets, best, petal_poses(best) @ to_petal, m, pairs, habit=habit, seed=seed, seconds=time.monotonic() - began)
+
+
+def judge(
+    names: list[str],
+    sheets: list[Sheet],
+    q: Array,
+    poses: Array,
+    m: Measured,
+    pairs: list[tuple[int, int]],
+    *,
+    habit: Habit,
+    seed: int = 0,
+    seconds: float = 0.0,
+) -> Assembly:
+    """Return what is to be said of a flower as its petals lie, whoever put them there.
+
+    Parameters
+    ----------
+    names, sheets : K petals and their meshes in scan frames, mm.
+    q, poses : (K, 6) coordinates, and the same as T_flower_scan (K, 4, 4).
+    m : what was measured.
+    pairs : (inner, outer) that hold.
+    habit : what is assumed of the flower.
+    seed, seconds : of the run.
+    """
     pierced = crossings(sheets, poses)
     residuals = m.residuals(q)
     crossing = sorted({(names[min(pair)], names[max(pair)]) for pair in pierced})
-    tell("done", 1.0)
     return Assembly(
         names=names,
         state="intersecting" if pierced else "free",
         poses=poses,
-        start=start,
+        start=petal_poses(m.start()) @ np.linalg.inv(petal_poses(q)) @ poses,
         clearance=0.0 if pierced else clearance(sheets, poses),
-        stem_angle=np.degrees(stem_angles(q, inflection)),
+        stem_angle=np.degrees(stem_angles(q, m.inflection)),
         azimuth=np.degrees(q[:, AZIMUTH]) % 360,
         residuals=residuals,
-        pairs=sorted((names[i], names[j]) if i_inside else (names[j], names[i]) for (i, j), i_inside in inside.items()),
+        pairs=sorted((names[inner], names[outer]) for inner, outer in pairs),
         intersecting=crossing,
         conflicts=_conflicts(names, residuals, on_receptacle(q, habit.receptacle_u).residual, crossing),
         habit=habit,
         seed=seed,
-        seconds=time.monotonic() - began,
+        seconds=seconds,
     )
 
 
@@ -295,5 +320,5 @@ def _conflicts(names: list[str], residuals: Array, off: Array, crossing: list[tu
     for a, b in crossing:
         pulls = [(abs(residuals[names.index(n), c]), n, what) for n in (a, b) for c, what in enumerate(MEASUREMENTS)]
         pull, name, what = max(pulls)
-        out.append(f"{a} and {b} still intersect: look first at {what} of {name} ({pull:.1f} standard uncertainties)")
+        out.append(f"{a} and {b} intersect: look first at {what} of {name} ({pull:.1f} standard uncertainties)")
     return out

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 AZIMUTH, RADIUS, HEIGHT, TILT, SIDE, ROLL = range(6)
 ANGLES = (AZIMUTH, TILT, ROLL)
+_UPRIGHT = 1e-9  # horizontal part of a midrib's direction, below which it points nowhere
 
 
 def _axes(q: Array) -> tuple[Array, Array, Array, Array]:
@@ -115,6 +116,39 @@ def measured_coordinates(azimuth: Array, radius: Array, height: Array, stem_angl
     tilt = np.arccos(np.clip(cosine, -1.0, 1.0)) - lean
     zero = np.zeros_like(tilt)
     return np.stack([np.radians(azimuth), radius, height, tilt, zero, zero], -1)
+
+
+def coordinates(T_flower_petal: Array) -> Array:
+    """Return the coordinates of petals' poses, so that `petal_poses` gives them back.
+
+    Of the two ways to write a pose, leaning out or, turned half round, in, the one with less roll. A petal upright to the last digit has no
+    roll.
+
+    Parameters
+    ----------
+    T_flower_petal : (K, 4, 4) rigid.
+
+    Returns
+    -------
+    (K, 6) coordinates; radians and mm.
+    """
+    x, midrib, base = (T_flower_petal[:, :3, column] for column in (0, 1, 3))
+    level = np.hypot(midrib[:, 0], midrib[:, 1])
+    ways = []
+    for way in (1.0, -1.0):
+        q = np.zeros((len(base), 6))
+        q[:, TILT] = way * np.arctan2(level, midrib[:, 2])
+        leaning = np.arctan2(way * midrib[:, 1], way * midrib[:, 0])
+        q[:, AZIMUTH] = np.where(level > _UPRIGHT, leaning, np.arctan2(x[:, 0], -x[:, 1]))
+        _, tangent, _, inner = _axes(q)
+        outward = np.stack([tangent[:, 1], -tangent[:, 0]], -1)
+        q[:, RADIUS] = np.einsum("ki,ki->k", base[:, :2], outward)
+        q[:, SIDE] = np.einsum("ki,ki->k", base, tangent)
+        q[:, HEIGHT] = base[:, 2]
+        q[:, ROLL] = np.arctan2(-np.einsum("ki,ki->k", x, inner), -np.einsum("ki,ki->k", x, tangent))
+        ways.append(q)
+    out, turned = ways
+    return np.where((np.abs(out[:, ROLL]) <= np.abs(turned[:, ROLL]))[:, None], out, turned)
 
 
 def moved(poses: Array, points: Array) -> Array:

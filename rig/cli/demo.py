@@ -14,18 +14,14 @@ from rig.cli.sweep import run_sweep
 from rig.config import load_config
 from rig.cultivars import TABLE_1
 from rig.errors import ConfigError
-from rig.fits import StoredFit, store_fit
+from rig.fits import ROSE_ASPECT, StoredFit, refitted, store_fit
 from rig.measuring import new_order
 from rig.progress import steps
 from rig.runs import Run, new_run_path
 from rig.trajectory import Trajectory, parse_angles
 from rig.units import duration
 
-ROSE_ASPECT = 1.9
-"""Height over width of rose cells, about 20 um wide and a little under 40 um high."""
-
-
-PETALS, OPENING, SEED = 25, 0.6, 1
+PETALS, OPENING, SEED = 25, 0.45, 3
 SIDE = 800
 """The virtual rose, and its picture in pixels."""
 
@@ -110,7 +106,7 @@ def closing_table(fits: dict[str, StoredFit], runs: dict[str, Run]) -> str:
     lines.append(f"{'':<4}" + "".join(f"{title:>10}" for title in titles) + f"{'I(+40)/I(-40)':>15}   run")
     for label, stored in fits.items():
         measured = dict(zip(map(round, stored.fit.theta_r_deg), stored.fit.measured, strict=True))
-        tall = fit_run(runs[label], aspect=ROSE_ASPECT)
+        tall = refitted(stored, ROSE_ASPECT)
         values = [*stored.fit.x.values(), stored.fit.E_mean, stored.fit.E_max, tall.fit.E_mean]
         ratio = measured[40] / measured[-40]
         lines.append(f"{label:<4}{''.join(f'{value:>10.4g}' for value in values)}{ratio:>15.2f}   {runs[label].id}")

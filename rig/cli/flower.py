@@ -93,7 +93,7 @@ def assembly_table(assembly: "Assembly") -> str:
     lines += [
         f"{name:<8}{stem:>12.2f}{azimuth:>10.2f}" + "".join(f"{r:>13.2f}" for r in residuals) for name, stem, azimuth, residuals in rows
     ]
-    lines.append("columns 4 on: assembled less measured, in standard uncertainties (heading and roll: less 0)")
+    lines.append("columns 4 on: assembled less measured, in standard uncertainties (base_side and roll: less 0)")
     if assembly.state == "free":
         lines.append(f"no two petals intersect; clearance {assembly.clearance:.3f} mm; {assembly.seconds:.1f} s")
     else:

@@ -5,6 +5,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 NUMBERS = (1, 2, 6, 7, 8, 9)
@@ -18,7 +19,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     from tests.conftest import rig_environment
 
     folder = tmp_path_factory.mktemp("demo")
-    done = subprocess.run([sys.executable, "-m", "rig", "demo"], cwd=folder, env=rig_environment(), capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "rig", "demo", "--petals", "7"], cwd=folder, env=rig_environment(), capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return folder / "rig-data", done.stdout
 
@@ -31,7 +34,8 @@ def texts(svg: Path) -> str:
 @pytest.mark.slow
 def test_the_closing_table_names_x_and_e_of_every_cultivar_and_where_all_lies(demo: tuple[Path, str]) -> None:
     workspace, said = demo
-    rows = {words[0]: words for line in said.splitlines() if (words := line.split()) and words[0] in ("BR", "RR", "PR", "WR")}
+    coefficients = said.split("E, 1.9:")[0]
+    rows = {words[0]: words for line in coefficients.splitlines() if (words := line.split()) and words[0] in ("BR", "RR", "PR", "WR")}
     assert list(rows) == ["BR", "RR", "PR", "WR"]
     assert "SIMULATED" in said
     for folder in ("runs", "fits", "figures"):
@@ -77,3 +81,31 @@ def test_the_figures_are_the_papers(demo: tuple[Path, str], number: int, words: 
     said = texts(workspace / "figures" / f"figure-{number}.svg")
     for word in words:
         assert word.replace(" ", "") in said
+
+
+@pytest.mark.slow
+def test_the_demo_goes_on_to_a_rose_that_nobody_put_together(demo: tuple[Path, str]) -> None:
+    import cv2
+
+    workspace, said = demo
+    assembled = json.loads((workspace / "flowers" / "demo" / "assembly.json").read_text())
+    assert assembled["state"] == "free"
+    assert len(assembled["petals"]) == 7
+    assert f"no two petals intersect; clearance {assembled['clearance_mm']:.3f} mm" in said
+    for name in ("figure-11.png", "figure-13.png", "figure-14.png", "rose.png"):
+        picture = cv2.imread(str(workspace / "figures" / name))
+        # More than paper or background: a good part of the picture is something else than its commonest colour.
+        colours, counts = np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
+        assert counts.max() < 0.9 * counts.sum()
+        assert len(colours) > 100
+
+
+@pytest.mark.slow
+def test_figure_14_stands_beside_the_readings(demo: tuple[Path, str]) -> None:
+    _, said = demo
+    rows = re.findall(r"^(BR|RR|PR|WR) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+)$", said, re.MULTILINE)
+    assert [row[0] for row in rows] == ["BR", "RR", "PR", "WR"]
+    ratios = [float(re.search(rf"^{row[0]} .* ([\d.]+) +20", said, re.MULTILINE)[1]) for row in rows]  # type: ignore[index]
+    assert [float(row[1]) for row in rows] == ratios
+    C = {row[0]: float(row[3]) for row in rows}
+    assert C["WR"] < min(C["BR"], C["RR"], C["PR"])  # the glossy petal

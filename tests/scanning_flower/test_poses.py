@@ -4,10 +4,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanning.poses import inverse, measured_coordinates, petal_poses, stem_angles, twists
+from scanning.poses import coordinates, inverse, measured_coordinates, petal_poses, stem_angles, twists
 
 angle = st.floats(-1.2, 1.2)
-coordinates = st.tuples(st.floats(-3, 3), st.floats(0.5, 10), st.floats(-3, 3), st.floats(0.1, 1.4), angle, angle)
+anywhere = st.tuples(st.floats(-3, 3), st.floats(0.5, 10), st.floats(-3, 3), st.floats(0.1, 1.4), angle, angle)
 
 
 def test_an_upright_petal_at_azimuth_0_faces_the_stem() -> None:
@@ -15,7 +15,7 @@ def test_an_upright_petal_at_azimuth_0_faces_the_stem() -> None:
     np.testing.assert_allclose(pose, [[0, 0, -1, 3], [-1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 0, 1]], atol=1e-15)
 
 
-@given(coordinates)
+@given(anywhere)
 def test_poses_are_rigid_and_put_the_base_where_it_was_measured(q: tuple[float, ...]) -> None:
     pose = petal_poses(np.array([q]))[0]
     np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-12)
@@ -25,7 +25,7 @@ def test_poses_are_rigid_and_put_the_base_where_it_was_measured(q: tuple[float, 
     np.testing.assert_allclose(along @ [pose[1, 3], -pose[0, 3]], q[4], atol=1e-12)
 
 
-@given(coordinates, st.integers(0, 5))
+@given(anywhere, st.integers(0, 5))
 def test_twists_are_the_derivatives_of_the_poses(q: tuple[float, ...], coordinate: int) -> None:
     at, step = np.array([q]), np.zeros(6)
     step[coordinate] = 1e-6
@@ -43,3 +43,12 @@ def test_the_measured_stem_angle_is_met(stem: float, azimuth: float, bend: float
     q = measured_coordinates(np.array([azimuth]), np.array([3.0]), np.array([1.0]), np.array([stem]), inflection)
     if abs(np.cos(np.radians(stem))) < np.hypot(*inflection[0, 1:]):
         np.testing.assert_allclose(np.degrees(stem_angles(q, inflection)), stem, atol=1e-6)
+
+
+turn = st.floats(-np.pi, np.pi)
+
+
+@given(turn, st.one_of(st.just(0.0), st.just(1e-12), turn), turn, st.tuples(*[st.floats(-20, 20)] * 3))
+def test_any_pose_is_given_back_by_its_coordinates(azimuth: float, tilt: float, roll: float, base: tuple[float, float, float]) -> None:
+    T = petal_poses(np.array([[azimuth, *base[:2], tilt, base[2], roll]]))
+    np.testing.assert_allclose(petal_poses(coordinates(T)), T, atol=1e-8)
