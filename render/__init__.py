@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from render.images import boxed, develop, exposure, write_exr, write_png
     from render.light import DistantLight, NearLight
     from render.raycast import Lambert, Picture, Raycaster
-    from render.scene import Mesh, Scene, read_flower, read_mesh
+    from render.scene import Mesh, Scene, read_flower, read_mesh, read_state
 
 _HOME = {
     "Box": "camera",
@@ -34,6 +34,7 @@ _HOME = {
     "exposure": "images",
     "measure_contrast": "contrast",
     "read_flower": "scene",
+    "read_state": "scene",
     "read_mesh": "scene",
     "write_exr": "images",
     "write_png": "images",
@@ -57,6 +58,7 @@ __all__ = [
     "measure_contrast",
     "read_flower",
     "read_mesh",
+    "read_state",
     "write_exr",
     "write_png",
 ]

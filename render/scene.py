@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -185,17 +186,41 @@ def read_flower(folder: str | Path) -> Scene:
         If the flower is not assembled yet or a file is missing or malformed.
     """
     folder = Path(folder)
+    table = _assembly(folder)
+    try:
+        placed = {str(name): petal["T_flower_scan"] for name, petal in sorted(table["petals"].items())}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise RenderError(
+            f"{folder / 'assembly.json'}: expected petals, each with its T_flower_scan ({type(error).__name__}: {error}): assemble again"
+        ) from error
+    return Scene(tuple(_placed(folder, placed)))
+
+
+def read_state(folder: str | Path) -> str:
+    """Return the state of an assembled flower: "free" where no two petals intersect.
+
+    Raises
+    ------
+    RenderError
+        If the flower is not assembled yet or its state is not told.
+    """
+    state = _assembly(Path(folder)).get("state")
+    if not isinstance(state, str):
+        raise RenderError(f"{Path(folder) / 'assembly.json'}: does not tell its state: assemble again")
+    return state
+
+
+def _assembly(folder: Path) -> dict[str, Any]:
     path = folder / "assembly.json"
     if not path.is_file():
         raise RenderError(f"{path}: no such file: the flower is not assembled yet")
     try:
-        petals = json.loads(path.read_text(encoding="utf-8"))["petals"]
-        placed = {str(name): petal["T_flower_scan"] for name, petal in sorted(petals.items())}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RenderError(
-            f"{path}: expected petals, each with its T_flower_scan ({type(error).__name__}: {error}): assemble again"
-        ) from error
-    return Scene(tuple(_placed(folder, placed)))
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RenderError(f"{path}: expected petals, each with its T_flower_scan ({error}): assemble again") from error
+    if not isinstance(table, dict):
+        raise RenderError(f"{path}: expected petals, each with its T_flower_scan: assemble again")
+    return table
 
 
 def _placed(folder: Path, placed: dict[str, ArrayLike]) -> Iterable[Mesh]:

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
     from rig.fits import StoredFit
 
+SIMULATED = "SIMULATED"
+"""What everything made from simulated readings or petals says."""
+
 DARK, PALE = ("BR", "RR"), ("PR", "WR")
 SCALES = {DARK: 40.0, PALE: 400.0}
 """Radial scales of the paper's figures 1 and 8, and 2 and 9."""
@@ -68,22 +71,22 @@ def draw_all(fits: Mapping[str, "StoredFit"], folder: Path) -> list[Path]:
     for name, (draw, size) in drawers.items():
         paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
         # Figure 6 is the model alone: nothing in it was measured.
-        with saved_figure(size, paths, simulated=simulated and name != "figure-6") as figure:
+        with saved_figure(size, paths, [SIMULATED] if simulated and name != "figure-6" else []) as figure:
             draw(figure)
         written += paths
     return written
 
 
 @contextmanager
-def saved_figure(size: tuple[float, float], paths: Sequence[Path], *, simulated: bool) -> Iterator["Figure"]:
-    """Yield an empty figure of `size` inches, marked where what it shows is simulated, and save it to `paths` afterwards."""
+def saved_figure(size: tuple[float, float], paths: Sequence[Path], marks: Sequence[str]) -> Iterator["Figure"]:
+    """Yield an empty figure of `size` inches with `marks` in its corner, and save it to `paths` afterwards."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
     with mpl.rc_context({"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "rig", "axes.titlesize": 10}):
         figure = Figure(figsize=size)
-        if simulated:
-            figure.text(0.985, 0.975, "SIMULATED", ha="right", va="top", fontsize=13, fontweight="bold", color="#B00000")
+        if marks:
+            figure.text(0.985, 0.975, ", ".join(marks), ha="right", va="top", fontsize=13, fontweight="bold", color="#B00000")
         yield figure
         for path in paths:
             figure.savefig(path, dpi=160, metadata={"Date": None} if path.suffix == ".svg" else None)

@@ -1,6 +1,6 @@
 """The paper's figures 11, 13 and 14: a petal's polygons, the flower with a detail, and the four cultivars' highlights."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ DETAIL = 0.28
 
 
 def draw_flower(
-    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, simulated: bool, shades: Shades | None = None
+    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, marks: Sequence[str], shades: Shades | None = None
 ) -> tuple[list[Path], str]:
     """Draw figures 11, 13 and 14 as PNG into `folder`; return the files and the table of contrasts.
 
@@ -30,8 +30,8 @@ def draw_flower(
     fits : mapping of cultivar (BR, RR, PR, WR) to its fit
     folder : Path
         Made where it is not there.
-    simulated : bool
-        Whether petals or readings are virtual: the figures then say so.
+    marks : sequence of str
+        What every figure must say of itself; see `rig.pictures.marks_of`.
     shades : Shades, optional
         Reflectance tables that exist already.
     """
@@ -46,7 +46,7 @@ def draw_flower(
     camera = frame(raycaster, SIDE, SIDE)
     written = [folder / f"figure-{number}.png" for number in (11, 13, 14)]
 
-    with saved_figure((9, 4.4), [written[0]], simulated=simulated) as figure:
+    with saved_figure((9, 4.4), [written[0]], marks) as figure:
         first = sorted(flower.glob("petals/*/mesh.ply"))[0]
         _polygons(figure, read_mesh(first), first.parent.name)
 
@@ -55,12 +55,12 @@ def draw_flower(
     side = round(SIDE * DETAIL)
     box = Box(*_brightest(picture.radiance, side), side, side)
     detail = show(take(raycaster, camera.detail(box, enlarge=SIDE / side), shades.of(fits["RR"])), "RR")
-    with saved_figure((9, 4.8), [written[1]], simulated=simulated) as figure:
+    with saved_figure((9, 4.8), [written[1]], marks) as figure:
         _images(figure, {"RR": boxed(whole, box), f"detail, {SIDE / side:.1f} times": detail})
 
     pictures, rows, matt = compare(raycaster, camera, fits, shades)
     images = {f"{r.label}: C {r.C:.2f}, I(+40)/I(-40) {r.measured:.2f}": show(pictures[r.label], r.label) for r in rows}
-    with saved_figure((9, 9.4), [written[2]], simulated=simulated) as figure:
+    with saved_figure((9, 9.4), [written[2]], marks) as figure:
         _images(figure, images)
     return written, contrast_table(rows, matt)
 

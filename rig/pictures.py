@@ -1,11 +1,13 @@
 """The flower with a fitted reflectance: from flower folder and fit to a picture."""
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rig.errors import RunError
+from rig.figures import SIMULATED
 from rig.fits import StoredFit, latest_fit, list_fits, read_fit
 
 if TYPE_CHECKING:
@@ -19,6 +21,8 @@ COLOURS = {"BR": (0.42, 0.02, 0.06), "RR": (0.85, 0.04, 0.06), "PR": (0.98, 0.55
 
 BACKGROUND = 0.2
 """Linear grey behind the flower: on black, its own shadows would have no outline."""
+
+MARK = (140, 0, 0)
 
 ABOVE = (0.4, -0.6, 0.85)
 """From where the flower is seen by default: from the front, a good way above its horizon."""
@@ -46,12 +50,21 @@ def is_simulated(flower: Path) -> bool:
         raise RunError(f"{flower / 'flower.toml'}: cannot be read: {exc}; a flower's folder was expected") from exc
 
 
-def marked(image: Any) -> Any:
-    """Return the image with SIMULATED written into its corner."""
+def marks_of(flower: Path, *fits: StoredFit) -> list[str]:
+    """Return what every picture of `flower` with `fits` must say of itself: that it is simulated, that petals intersect."""
+    from render.scene import read_state
+
+    marks = [SIMULATED] if is_simulated(flower) or any(fit.simulated for fit in fits) else []
+    return marks if read_state(flower) == "free" else [*marks, "PETALS INTERSECT"]
+
+
+def marked(image: Any, marks: Sequence[str]) -> Any:
+    """Return the image with marks written into its corner."""
     import cv2
 
     size = image.shape[1] / 800
-    return cv2.putText(image.copy(), "SIMULATED", (round(14 * size), round(34 * size)), cv2.FONT_HERSHEY_SIMPLEX, size, (255, 96, 96), 2)
+    place, font = (round(14 * size), round(34 * size)), cv2.FONT_HERSHEY_SIMPLEX
+    return cv2.putText(image.copy(), ", ".join(marks), place, font, size, MARK, 2) if marks else image
 
 
 @dataclass

@@ -2,8 +2,15 @@
 
 The scanner looks along z: a jump is a difference of depth between neighbours on the grid. Depth is smoothed by a polynomial of second order
 through each point's own side of the rim (moving least squares, one-sided at the rim): it neither shrinks a curved surface nor pulls the
-rim's depth inwards, as a mean or a Gaussian would. x and y stay as measured, but at the rim: the grid's staircase lies up to a step inside
-the outline, and each of its points moves, within half a step, to the border half way between what was measured and what was not.
+rim's depth inwards, as a mean or a Gaussian would.
+
+Single readings that went, half on the petal and half beside it, leave notches of a step in the rim. A notch with measured points on both
+sides is closed: the depth of its point is not measured but extrapolated, by one step, from the surface beside it; x and y are those of the
+place's line of sight. Nothing else is filled: no holes, nothing as wide as an island.
+
+x and y stay as measured, but at the rim: the grid's staircase lies up to a step inside the outline, and each of its points moves, within
+three quarters of a step, to the border half way between what was measured and what was not. Of the height of waves that the rim has itself
+five sixths stay where they are ten steps long, three fifths where they are five: shorter ones are not told from the staircase.
 """
 
 from __future__ import annotations
@@ -23,7 +30,10 @@ _SAMPLED = 10_000
 _LEAST_RADIUS, _MOST_RADIUS = 3, 10  # of the smoothing window, grid steps
 _RADIUS_FOR_NOISE = 13.0  # measured on scans of virtual petals
 _RIM_BLUR = 1.0  # grid steps: corners of the outline sharper than that are rounded
-_RIM_MOVE = 0.49  # grid steps, at most
+_RIM_MOVE = 0.75  # grid steps, at most: the corners of a staircase of 45 degrees lie 0.71 inside
+_MOST_SINGLE = 3  # mixed points beside each other may hang together; a piece of more is an island
+_NOTCH_NEIGHBOURS = 4  # of eight; a place beside a straight rim has three
+_NOTCH_RADIUS = 5  # of the window a closed notch's depth comes from, at most: the smoothing does the rest
 _LEAST_LEVELS = 5  # two surfaces parted by a jump are not a quantum
 
 
@@ -69,7 +79,7 @@ class Cleaned:
     Attributes
     ----------
     image : RangeImage
-        The points that stay, depth smoothed and the rim's staircase straightened.
+        The points that stay and those of closed notches, depth smoothed and the rim's staircase straightened.
     jump : float, mm
         Depth difference taken for a jump.
     quantum : float, mm
@@ -77,7 +87,9 @@ class Cleaned:
     roughness : float, mm
         Root mean square distance of measured depths from the local surface.
     removed : dict
-        Count of points by reason: background, grazing, spike, island.
+        Count of readings by reason: background, grazing, spike, island.
+    closed_notches : int
+        How many of the removed readings' places have a point all the same, its depth extrapolated by one step.
     """
 
     image: RangeImage
@@ -85,10 +97,11 @@ class Cleaned:
     quantum: float
     roughness: float
     removed: dict[str, int] = field(default_factory=dict)
+    closed_notches: int = 0
 
 
 def clean(image: RangeImage, how: Cleaning | None = None) -> Cleaned:
-    """Keep the largest surface of a scan, without background, grazing parts, spikes and islands; smooth its depth.
+    """Keep the largest surface of a scan, without background, grazing parts, spikes and islands; smooth its depth and its rim.
 
     Parameters
     ----------
@@ -110,10 +123,12 @@ def clean(image: RangeImage, how: Cleaning | None = None) -> Cleaned:
     quantum = depth_quantum(depth[image.valid])
     jump = how.jump if how.jump is not None else step * math.tan(math.radians(how.grazing)) + quantum
     removed: dict[str, int] = {}
+    singles = np.zeros(image.shape, dtype=bool)  # readings that went for themselves, not with a piece or what lies behind
 
-    def drop(reason: str, bad: NDArray[np.bool_]) -> None:
+    def drop(reason: str, bad: NDArray[np.bool_], single: NDArray[np.bool_] | bool = False) -> None:
         gone = bad & ~np.isnan(depth)
         depth[gone] = np.nan
+        singles[gone & single] = True
         removed[reason] = removed.get(reason, 0) + int(np.count_nonzero(gone))
         left = int(image.valid.sum()) - sum(removed.values())
         if left < _LEAST_POINTS:
@@ -127,7 +142,8 @@ def clean(image: RangeImage, how: Cleaning | None = None) -> Cleaned:
     def drop_islands(label: NDArray[np.int32], count: int) -> None:
         if count > 1:
             here = np.where(np.isnan(depth), 0, label)
-            drop("island", here != int(np.argmax(np.bincount(here.ravel(), minlength=count + 1)[1:])) + 1)
+            sizes = np.bincount(here.ravel(), minlength=count + 1)
+            drop("island", here != int(np.argmax(sizes[1:])) + 1, (sizes <= _MOST_SINGLE)[here])
 
     drop("background", np.zeros(image.shape, dtype=bool) if how.behind is None else depth < how.behind)
     label, count = grid.islands(depth, jump)
@@ -139,22 +155,27 @@ def clean(image: RangeImage, how: Cleaning | None = None) -> Cleaned:
     far = grid.rim_distance(depth, jump, 3)
     residual = np.abs(grid.plane_residual(depth, far, jump, fit_weights(3)))
     spread = 1.4826 * _median(residual)
-    drop("spike", residual > max(how.spike * spread, step))
-    drop("grazing", grid.too_steep(depth, jump, 2 * step * math.tan(math.radians(how.grazing)), quantum))
+    drop("spike", residual > max(how.spike * spread, step), True)
+    drop("grazing", grid.too_steep(depth, jump, 2 * step * math.tan(math.radians(how.grazing)), quantum), True)
     drop_islands(*grid.islands(depth, jump))
 
     radius = how.smooth if how.smooth is not None else default_radius(spread, step)
     weights = fit_weights(radius or _LEAST_RADIUS)
+    points = image.points.copy()
+    closed = np.zeros(image.shape, dtype=bool)
+    if radius and singles.any():
+        places = singles & outside(depth)
+        closed = grid.close_notches(points, depth, places, jump, _NOTCH_NEIGHBOURS, fit_weights(min(radius, _NOTCH_RADIUS)))
     far = grid.rim_distance(depth, jump, len(weights) // 2)
     valid = far >= 0
     # A point removed beside the petal was most likely half on it.
     cover = np.where(valid, 1.0, np.where(front & _beside(valid), 0.5, 0.0))
     move = grid.rim_moves(cover, far, _RIM_BLUR, _RIM_MOVE) if radius else np.zeros((*valid.shape, 2))
     smooth = grid.smoothed(depth, far, jump, weights, move)
-    off = (smooth - depth)[far > 0]
+    off = (smooth - depth)[(far > 0) & ~closed]
     roughness = float(np.sqrt(np.mean(off * off))) if off.size else 0.0
-    points = grid.moved(image.points, depth, smooth if radius else depth, move)
-    return Cleaned(RangeImage(points, valid, image.source), jump, quantum, roughness, removed)
+    points = grid.moved(points, depth, smooth if radius else depth, move)
+    return Cleaned(RangeImage(points, valid, image.source), jump, quantum, roughness, removed, int(np.count_nonzero(closed)))
 
 
 def default_radius(noise: float, step: float) -> int:
@@ -186,6 +207,18 @@ def _beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     beside[:, 1:] |= mask[:, :-1]
     beside[:, :-1] |= mask[:, 1:]
     return beside
+
+
+def outside(depth: Array) -> NDArray[np.bool_]:
+    """Places without a point that hang together, over the four neighbours, with the window's border: those of holes do not."""
+    from scanning import grid
+
+    label, count = grid.islands(np.where(np.isnan(depth), 0.0, np.nan), 1.0)
+    open_ = np.zeros(count + 1, dtype=bool)
+    for edge in (label[0], label[-1], label[:, 0], label[:, -1]):
+        open_[edge] = True
+    open_[0] = False
+    return np.asarray(open_[label])
 
 
 def depth_quantum(depth: Array) -> float:

@@ -522,6 +522,74 @@ def spacing(points: Array, depth: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def in_notch(depth: Array, i: int, j: int, jump: float, least: int) -> float:
+    """Mean depth of the neighbours of a place without a point where it is a notch of one surface, NaN where it is none.
+
+    A notch: of its eight neighbours at least so many, but not all four nearest, follow each other round it and are linked each to the next.
+    """
+    height, width = depth.shape
+    down, right = (-1, -1, 0, 1, 1, 1, 0, -1), (0, 1, 1, 1, 0, -1, -1, -1)
+    count, nearest, arcs, total = 0, 0, 0, 0.0
+    k, m = i + down[7], j + right[7]
+    before = depth[k, m] if 0 <= k < height and 0 <= m < width else np.nan
+    for q in range(8):
+        k, m = i + down[q], j + right[q]
+        here = depth[k, m] if 0 <= k < height and 0 <= m < width else np.nan
+        if not math.isnan(here):
+            count += 1
+            nearest += q % 2 == 0
+            total += here
+            arcs += not abs(here - before) <= jump
+        before = here
+    return total / count if count >= least and nearest < 4 and arcs == 1 else np.nan
+
+
+@njit(cache=True, nogil=True)
+def close_notches(points: Array, depth: Array, candidate: Mask, jump: float, least: int, weight: Array) -> Mask:
+    """Give places in notches of the surface's rim a point, in `points` and `depth`; where, as a mask of shape (H, W).
+
+    Depth is that of the polynomial of second order through the linked points of the window, asked one step beyond them; x and y are
+    those of the place's own line of sight there, from its neighbours' and the grid's spacing. What is closed bears out no other notch.
+    """
+    height, width = depth.shape
+    size = len(weight)
+    radius = size // 2
+    step = spacing(points, depth)
+    seen = np.empty((size, size), np.bool_)
+    stack = np.empty(size * size, np.int32)
+    normal, right = np.empty((6, 6)), np.empty(6)
+    found = np.full((height, width), np.nan)
+    for i in range(height):
+        for j in range(width):
+            if not candidate[i, j]:
+                continue
+            near = in_notch(depth, i, j, jump, least)
+            if math.isnan(near):
+                continue
+            depth[i, j] = near
+            reachable(depth, jump, i, j, radius, seen, stack)
+            seen[radius, radius] = False
+            if fit_window(depth, i, j, seen, weight, normal, right) and abs(right[0]) <= jump:
+                found[i, j] = near + right[0]
+            depth[i, j] = np.nan
+    closed = ~np.isnan(found)
+    for i in range(height):
+        for j in range(width):
+            if not closed[i, j]:
+                continue
+            x, y, count = 0.0, 0.0, 0
+            for k in range(max(0, i - 1), min(height, i + 2)):
+                for m in range(max(0, j - 1), min(width, j + 2)):
+                    if not math.isnan(depth[k, m]) and not closed[k, m]:
+                        x += points[k, m, 0] - (k - i) * step[0, 0] - (m - j) * step[1, 0]
+                        y += points[k, m, 1] - (k - i) * step[0, 1] - (m - j) * step[1, 1]
+                        count += 1
+            points[i, j, 0], points[i, j, 1], points[i, j, 2] = x / count, y / count, found[i, j]
+            depth[i, j] = found[i, j]
+    return closed
+
+
+@njit(cache=True, nogil=True)
 def shift(bell: Array, rate: float, out: Array) -> None:
     """A table times exp(rate x), x counted from its middle."""
     grown = math.exp(rate)
@@ -533,7 +601,7 @@ def shift(bell: Array, rate: float, out: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def rim_moves(cover: Array, far: Indices, width_of_blur: float, most: float) -> Array:
-    """How far points of the rim lie from the smooth border of what is covered, shape (H, W, 2), steps along rows and columns.
+    """How far points of the rim, with a nearest neighbour missing, lie from the smooth border of what is covered, shape (H, W, 2), steps.
 
     The border is where `cover` (1 on the surface, 0 beside it, between at mixed points), blurred by a Gaussian, is a half: on a straight
     rim that is the rim, whatever way the grid's staircase runs along it. No move is longer than `most`, and none turns a triangle over.
@@ -547,7 +615,7 @@ def rim_moves(cover: Array, far: Indices, width_of_blur: float, most: float) -> 
     g, h = np.empty(size), np.empty(size)
     for i in range(1, height - 1):
         for j in range(1, width - 1):
-            if far[i, j] != 0:
+            if far[i, j] != 0 or min(far[i - 1, j], far[i + 1, j], far[i, j - 1], far[i, j + 1]) >= 0:
                 continue
             v, u = 0.0, 0.0
             for _ in range(3):  # Newton's method along the steepest slope

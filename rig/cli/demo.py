@@ -81,18 +81,18 @@ def picture_rose(flower: Path, fits: dict[str, StoredFit], folder: Path) -> Path
     from render.raycast import Raycaster
     from render.scene import read_flower
     from rig.flowerfigures import draw_flower
-    from rig.pictures import Shades, frame, marked, show, take
+    from rig.pictures import Shades, frame, marked, marks_of, show, take
 
-    shades = Shades({})
+    shades, marks = Shades({}), marks_of(flower, *fits.values())
     with steps("ray-casting") as progress:
         progress(0, 2, "figures 11, 13, 14")
-        _, contrasts = draw_flower(flower, fits, folder, simulated=True, shades=shades)
+        _, contrasts = draw_flower(flower, fits, folder, marks=marks, shades=shades)
         progress(1, 2, "the rose")
         raycaster = Raycaster(read_flower(flower))
         picture = take(raycaster, frame(raycaster, SIDE, SIDE), shades.of(fits["RR"]), samples=9)
     click.echo("\n" + contrasts)
     path = folder / "rose.png"
-    write_png(marked(show(picture, "RR")), path)
+    write_png(marked(show(picture, "RR"), marks), path)
     write_exr(picture, path.with_suffix(".exr"))
     return path
 

@@ -7,7 +7,6 @@ import click
 from rig.cli.settings import Settings
 from rig.cultivars import TABLE_1
 from rig.fits import latest_fit
-from rig.pictures import is_simulated
 
 
 @click.command(epilog="\b\nExamples:\n  rig figures\n  rig figures --flower rose --out paper/")
@@ -25,9 +24,9 @@ def command(settings: Settings, flower: Path | None, out: str | None) -> None:
     if flower is None:
         return
     from rig.flowerfigures import draw_flower
+    from rig.pictures import marks_of
 
-    simulated = is_simulated(flower) or any(fit.simulated for fit in fits.values())
-    written, contrasts = draw_flower(flower, fits, folder, simulated=simulated)
+    written, contrasts = draw_flower(flower, fits, folder, marks=marks_of(flower, *fits.values()))
     for path in written:
         click.echo(path)
     click.echo(contrasts, err=True)

@@ -6,7 +6,7 @@ import click
 
 from rig.cli.settings import Settings
 from rig.errors import ConfigError
-from rig.pictures import ABOVE, Shades, find_fit, frame, is_simulated, marked, show, take
+from rig.pictures import ABOVE, Shades, find_fit, frame, marked, marks_of, show, take
 
 
 @click.command(
@@ -53,11 +53,13 @@ def command(
     lamp = NearLight(_triple(light_at, "--light-at")) if light_at else DistantLight(_triple(light, "--light")) if light else DistantLight()
     picture = take(raycaster, camera, Shades({}).of(fit), light=lamp, samples=samples)
     path = Path(out) if out else Path(flower) / f"{fit.label}.png"
-    image = show(picture, fit.label)
-    write_png(marked(image) if fit.simulated or is_simulated(Path(flower)) else image, path)
+    marks = marks_of(Path(flower), fit)
+    write_png(marked(show(picture, fit.label), marks), path)
     write_exr(picture, path.with_suffix(".exr"))
     click.echo(path)
     click.echo(path.with_suffix(".exr"))
+    if marks:
+        click.echo(", ".join(marks), err=True)
 
 
 def _numbers(text: str, option: str, count: int) -> tuple[float, ...]:

@@ -89,3 +89,17 @@ def test_two_views_are_brought_together(rig, shared_data: Path, tmp_path: Path) 
     # bun.conf, in mm: the published place of bun045 in the frame of bun000.
     assert np.array(found["T_target_source"])[:3, 3] == pytest.approx([-52.0211, -0.383981, -10.9223], abs=0.3)
     assert (tmp_path / "both.ply").exists()
+
+
+def test_a_flower_whose_petals_intersect_is_never_shown_as_good(tmp_path: Path) -> None:
+    from rig.pictures import marked, marks_of
+
+    (tmp_path / "flower.toml").write_text("simulated = true\n")
+    table = {"state": "intersecting", "petals": {}}
+    (tmp_path / "assembly.json").write_text(json.dumps(table))
+    assert marks_of(tmp_path) == ["SIMULATED", "PETALS INTERSECT"]
+    (tmp_path / "assembly.json").write_text(json.dumps(table | {"state": "free"}))
+    assert marks_of(tmp_path) == ["SIMULATED"]
+    blank = np.full((800, 800, 3), 124, np.uint8)
+    assert not np.array_equal(marked(blank, ["PETALS INTERSECT"]), blank)
+    np.testing.assert_array_equal(marked(blank, []), blank)
