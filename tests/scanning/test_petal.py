@@ -12,7 +12,7 @@ from scanning.clean import clean
 from scanning.errors import PetalError
 from scanning.formats import read_range_image
 from scanning.formats.ply import read_mesh
-from scanning.mesh import TriangleMesh, boundary_loops
+from scanning.mesh import TriangleMesh, area, boundary_loops, loop_length
 from scanning.petal import Petal, measure_petal, narrowness_along
 from scanning.rangeimage import RangeImage
 from scanning.triangulate import triangulate
@@ -163,17 +163,25 @@ def test_every_petal_of_a_rose_is_known_by_its_claw(rose: Path) -> None:
         found = measure_petal(mesh, name=name)
         assert np.linalg.norm(found.base - petal["base"]) < 1.0, name
         assert found.narrowness < 0.84, name
-        # The rim is met, and the surface smooth.
+        # The rim is met, and no more ragged than the petal's own.
         true = read_mesh(rose / f"{name}.ply")
-        border = true.vertices[boundary_loops(true.triangles)[0]]
-        rim = mesh.vertices[boundary_loops(mesh.triangles)[0]]
-        assert np.median(cKDTree(finely(border)).query(rim)[0]) < petal["step"], name
+        border, rim = (m.vertices[boundary_loops(m.triangles)[0]] for m in (true, mesh))
+        off = cKDTree(finely(border)[:, :2]).query(rim[:, :2])[0] / petal["step"]
+        assert np.sqrt(np.mean(off**2)) < 0.45, name
+        assert np.median(cKDTree(finely(border)).query(rim)[0]) < 0.5 * petal["step"], name
+        assert 0.98 < length(rim) / length(border) < 1.05, name
+        assert 0.98 < area(mesh) / area(true) < 1.01, name
 
 
 def finely(loop: np.ndarray) -> np.ndarray:
     """Points along a closed line, fifty for each of its sides."""
     part = np.arange(50)[:, None, None] / 50
     return np.asarray(((1 - part) * loop + part * np.roll(loop, -1, axis=0)).reshape(-1, 3))
+
+
+def length(loop: np.ndarray) -> float:
+    """Length of a closed line."""
+    return loop_length(loop, np.arange(len(loop), dtype=np.int32))
 
 
 def test_a_base_can_be_given() -> None:

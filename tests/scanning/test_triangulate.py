@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from scanning.clean import clean
 from scanning.errors import EmptyScanError
 from scanning.mesh import area, area_vectors, boundary_loops, loop_length, vertex_areas, vertex_normals
 from scanning.rangeimage import RangeImage
 from scanning.triangulate import triangulate
-from tests.scanning.surfaces import STEP, scan
+from tests.scanning.surfaces import STEP, Array, scan, with_depths
 
 
 def test_plane() -> None:
@@ -78,6 +80,26 @@ def test_always_one_manifold_sheet(seed: int, size: int, filled: float, bumpy: f
     )
     # A disc with holes: one sheet in the plane.
     assert len(mesh.vertices) - len(edges) + len(mesh.triangles) == 2 - len(loops)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.6), st.floats(6.0, 14.0))
+def test_a_manifold_without_overturned_triangles_whatever_is_mixed(seed: int, share: float, reach: float) -> None:
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(0, 0.4, 3)
+
+    def inside(x: Array, y: Array) -> NDArray[np.bool_]:
+        angle = np.arctan2(y, x)
+        return np.asarray(np.hypot(x, y) < reach + sum(wave * np.cos((2 + k) * angle) for k, wave in enumerate(waves)))
+
+    image = scan(lambda x, y: 0.01 * x**2, inside, size=100, noise=0.03)
+    valid = image.valid
+    rim = valid & ~(np.roll(valid, 1, 0) & np.roll(valid, -1, 0) & np.roll(valid, 1, 1) & np.roll(valid, -1, 1))
+    changes = np.where(rim & (rng.random(valid.shape) < share), -rng.uniform(0.5, 12.0, valid.shape), 0.0)
+    cleaned = clean(with_depths(image, changes))
+    mesh = triangulate(cleaned.image, cleaned.jump)
+    boundary_loops(mesh.triangles)
+    assert area_vectors(mesh)[:, 2].min() > 0.02 * STEP**2
 
 
 def test_touching_borders_are_no_manifold() -> None:

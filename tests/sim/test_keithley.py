@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from sim.clock import ManualClock
 from sim.errors import SimError
 from sim.keithley import RANGES, Keithley6485, MeterModel
+from tests.sim.lines import Recorder
 
 OVERFLOW = 9.9e37
 START = "*RST;:SYST:ZCH ON;:CURR:RANG 2e-9;:INIT;:SYST:ZCOR:ACQ;:SYST:ZCOR ON;:CURR:RANG:AUTO ON;:SYST:ZCH OFF;:FORM:ELEM READ,TIME,STAT"
@@ -325,23 +326,6 @@ def test_start_sequence_of_the_sheet_command_by_command(desk: Desk) -> None:
 
 
 # Wire
-
-
-class Recorder:
-    """A line whose client says some things and listens."""
-
-    def __init__(self) -> None:
-        self.said: asyncio.Queue[bytes] = asyncio.Queue()
-        self.heard: list[bytes] = []
-
-    async def read(self) -> bytes:
-        return await self.said.get()
-
-    def write(self, data: bytes) -> None:
-        self.heard.append(data)
-
-    async def drain(self) -> None:
-        return
 
 
 def served(*pieces: bytes, current: float = 1e-7, terminator: str = "LF", advance: float = 100.0) -> list[bytes]:

@@ -13,6 +13,7 @@ from sim.clock import ManualClock
 from sim.errors import SimError
 from sim.motion import Ringing
 from sim.zaber import Command, StageModel, ZaberChain, checksum, parse
+from tests.sim.lines import Recorder
 
 TURN = 1_536_000
 VECTORS = [
@@ -391,23 +392,6 @@ def test_alerts_come_once_per_motion_and_only_if_wanted(homed: Desk) -> None:
     homed.wait()
     assert homed.chain.alerts() == [b"!01 1 IDLE --\r\n"]
     assert homed.chain.alerts() == []
-
-
-class Recorder:
-    """A line whose client says some things and listens."""
-
-    def __init__(self) -> None:
-        self.said: asyncio.Queue[bytes] = asyncio.Queue()
-        self.heard: list[bytes] = []
-
-    async def read(self) -> bytes:
-        return await self.said.get()
-
-    def write(self, data: bytes) -> None:
-        self.heard.append(data)
-
-    async def drain(self) -> None:
-        return
 
 
 def test_alerts_reach_every_line_when_the_motion_ends() -> None:
