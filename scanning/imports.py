@@ -164,6 +164,7 @@ def _import(
         "triangles": len(mesh.triangles),
         "holes": petal.holes,
         **{f"removed_{reason}": count for reason, count in cleaned.removed.items()},
+        "closed_notches": cleaned.closed_notches,
         "removed_loose": int(cleaned.image.valid.sum()) - len(mesh.vertices),
         "roughness_mm": cleaned.roughness,
         "quantum_mm": cleaned.quantum,

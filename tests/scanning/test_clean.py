@@ -90,7 +90,7 @@ def test_moves_of_the_rim_turn_no_triangle_over(filled: float) -> None:
     for _ in range(5):
         image = scan(lambda x, y: 0.0 * x, lambda x, y: rng.random(x.shape) < filled, size=40)
         depth = image.points[..., 2]
-        move = grid.rim_moves(image.valid.astype(float), grid.rim_distance(depth, 2.0, 3), 1.0, 0.75)
+        move = grid.rim_moves(image.valid.astype(float), grid.rim_distance(depth, 2.0, 3), 0.8, 0.75)
         assert np.hypot(*np.moveaxis(move, -1, 0)).max() > 0.6
         mesh = triangulate(RangeImage(grid.moved(image.points, depth, depth, move), image.valid), 2.0)
         assert area_vectors(mesh)[:, 2].min() > 0.02 * STEP**2
@@ -201,7 +201,7 @@ def test_waves_of_ten_steps_stay_on_the_rim() -> None:
     angle = np.arctan2(y, x)
     found = np.linalg.lstsq(np.stack([np.ones_like(angle), np.cos(waves * angle)], axis=1), np.hypot(x, y), rcond=None)[0]
     assert found[0] == pytest.approx(radius, abs=0.2 * STEP)
-    assert 0.8 * height < found[1] < height
+    assert 0.87 * height < found[1] < height
 
 
 @pytest.mark.parametrize("radius", [3, 6])
