@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # the first kernels of a new installation are compiled by the demo
 NUMBERS = (1, 2, 6, 7, 8, 9)
 
 
@@ -20,7 +21,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     folder = tmp_path_factory.mktemp("demo")
     done = subprocess.run(
-        [sys.executable, "-m", "rig", "demo", "--petals", "7"], cwd=folder, env=rig_environment(), capture_output=True, text=True
+        [sys.executable, "-m", "rig", "demo", "--petals", "5"], cwd=folder, env=rig_environment(), capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return folder / "rig-data", done.stdout
@@ -31,7 +32,6 @@ def texts(svg: Path) -> str:
     return "".join("".join("".join(element.itertext()) for element in ET.parse(svg).iter("{http://www.w3.org/2000/svg}text")).split())
 
 
-@pytest.mark.slow
 def test_the_closing_table_names_x_and_e_of_every_cultivar_and_where_all_lies(demo: tuple[Path, str]) -> None:
     workspace, said = demo
     coefficients = said.split("E, 1.9:")[0]
@@ -47,7 +47,6 @@ def test_the_closing_table_names_x_and_e_of_every_cultivar_and_where_all_lies(de
         )
 
 
-@pytest.mark.slow
 def test_the_papers_phenomenon_is_in_the_readings(demo: tuple[Path, str]) -> None:
     _, said = demo
     ratios = [float(re.search(rf"^{label} .* ([\d.]+) +20", said, re.MULTILINE)[1]) for label in ("BR", "RR", "PR", "WR")]  # type: ignore[index]
@@ -56,7 +55,6 @@ def test_the_papers_phenomenon_is_in_the_readings(demo: tuple[Path, str]) -> Non
     assert ratios[-1] < 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", NUMBERS)
 def test_every_plot_of_simulated_readings_says_so(demo: tuple[Path, str], number: int) -> None:
     workspace, _ = demo
@@ -65,7 +63,6 @@ def test_every_plot_of_simulated_readings_says_so(demo: tuple[Path, str], number
     assert (workspace / "figures" / f"figure-{number}.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "words"),
     [
@@ -83,14 +80,13 @@ def test_the_figures_are_the_papers(demo: tuple[Path, str], number: int, words: 
         assert word.replace(" ", "") in said
 
 
-@pytest.mark.slow
 def test_the_demo_goes_on_to_a_rose_that_nobody_put_together(demo: tuple[Path, str]) -> None:
     import cv2
 
     workspace, said = demo
     assembled = json.loads((workspace / "flowers" / "demo" / "assembly.json").read_text())
     assert assembled["state"] == "free"
-    assert len(assembled["petals"]) == 7
+    assert len(assembled["petals"]) == 5
     assert f"no two petals intersect; clearance {assembled['clearance_mm']:.3f} mm" in said
     for name in ("figure-11.png", "figure-13.png", "figure-14.png", "rose.png"):
         picture = cv2.imread(str(workspace / "figures" / name))
@@ -100,7 +96,6 @@ def test_the_demo_goes_on_to_a_rose_that_nobody_put_together(demo: tuple[Path, s
         assert len(colours) > 100
 
 
-@pytest.mark.slow
 def test_figure_14_stands_beside_the_readings(demo: tuple[Path, str]) -> None:
     _, said = demo
     rows = re.findall(r"^(BR|RR|PR|WR) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+) +([\d.]+)$", said, re.MULTILINE)
