@@ -277,7 +277,7 @@ def view(folder: Path, fit: "StoredFit | None" = None, *, port: int = 0) -> "tup
     colliding = {name for pair in table.get("intersecting", []) for name in pair if name in petals}
     notes = ["SIMULATED"] if is_simulated(folder) or (fit and fit.simulated) else []
     notes.append(told_state(table) + (" (orange): not usable as it is" if colliding else ""))
-    if moved := sorted({name for save in table.get("by_hand", {}).get("saves", []) for name in save["moved"]}):
+    if moved := _moved(table):
         notes.append(f"moved by hand: {', '.join(moved)}")
     hue = COLOURS.get(fit.label) if fit else None
     if fit:
@@ -292,6 +292,19 @@ def view(folder: Path, fit: "StoredFit | None" = None, *, port: int = 0) -> "tup
         notes=notes,
     )
     return page, notes
+
+
+def moved_by_hand(folder: Path) -> list[str]:
+    """Return the petals that were moved by hand since the flower was assembled."""
+    try:
+        table = json.loads((folder / "assembly.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []  # nothing that could be lost
+    return _moved(table)
+
+
+def _moved(table: Mapping[str, Any]) -> list[str]:
+    return sorted({name for save in table.get("by_hand", {}).get("saves", []) for name in save["moved"]})
 
 
 def told_state(table: Mapping[str, Any]) -> str:

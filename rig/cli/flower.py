@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rig.cli.view import browser_option, port_option, serve
+from rig.errors import ConfigError
 from rig.progress import steps
 
 if TYPE_CHECKING:
@@ -53,9 +54,14 @@ def check(folder: Path, as_json: bool) -> int:
 @command.command("assemble", epilog="\b\nExamples:\n  rig flower assemble rose\n  rig flower assemble rose --seed 3 --json")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of the choice of vertices that are looked at.")
+@click.option("--discard-edits", is_flag=True, help="Assemble although petals were moved by hand since.")
 @click.option("--json", "as_json", is_flag=True, help="For programs.")
-def assemble(folder: Path, seed: int, as_json: bool) -> int:
+def assemble(folder: Path, seed: int, discard_edits: bool, as_json: bool) -> int:
     """Find every petal's T and alpha of eq. (14); exit code 1 where petals still pass through each other."""
+    from rig.flowerpages import moved_by_hand
+
+    if not discard_edits and (moved := moved_by_hand(folder)):
+        raise ConfigError(f"{folder}: moved by hand: {', '.join(moved)}; --discard-edits assembles anew without that work")
     assembly = put_together(folder, seed)
     if as_json:
         click.echo((folder / "assembly.json").read_text(encoding="utf-8"))

@@ -57,6 +57,8 @@ def test_from_scans_to_a_picture(rig, rose: Path, tmp_path: Path) -> None:
     kept = json.loads((tmp_path / "flower" / "assembly.json").read_text())
     assert kept["petals"]["P01"]["stem_angle"] == pytest.approx(60.0)
     assert kept["by_hand"]["saves"][0]["moved"] == ["P01"]
+    assert "moved by hand: P01; --discard-edits" in rig("flower", "assemble", "flower", check=2).stderr
+    assert json.loads((tmp_path / "flower" / "assembly.json").read_text()) == kept
 
     (tmp_path / "t.csv").write_text("theta_i,theta_r,value\n" + "".join(f"45,{t},{20 + 10 * (t > 0)}\n" for t in range(-60, 61, 20)))
     fit = json.loads(rig("fit", "t.csv", "--json").stdout)["id"]
