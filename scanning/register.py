@@ -21,6 +21,7 @@ from scanning.mesh import Array, TriangleMesh, vertex_normals
 _THINNED = 45  # sides of a voxel along the diagonal of the scan
 _TRIES = 3
 _LEAST_POINTS = 100
+_FINE_POINTS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +105,10 @@ def register(
             break
     assert best is not None
     pose = best[1]
+    # More points of the source would take longer and not tell more: six numbers are sought.
+    some = clouds[0].uniform_down_sample(max(1, len(source.vertices) // _FINE_POINTS))
     for reach in (4 * step, 2 * step):
-        pose = _refined(clouds, reach, pose, 30, o3d).transformation
+        pose = _refined((some, clouds[1]), reach, pose, 30, o3d).transformation
     pose = np.array(pose)
     fitness, rmse = _on_each_other(clouds, pose, 1.5 * step)
     hanging = in_free_space(source, target, pose, steps[1])
