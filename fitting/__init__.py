@@ -9,16 +9,24 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fitting.cells import CELL_AREA, Dome
-    from fitting.errors import DomainError, FitError, ReadingError, TableError
+    from fitting.body import BodyTrace, Epidermis, trace_body
+    from fitting.cells import CELL_AREA, Cell, Spread
+    from fitting.errors import DomainError, EnergyError, FitError, ReadingError, TableError
     from fitting.measurements import Measurements, read_csv
     from fitting.mixture import MixtureFit, fit_mixture
+    from fitting.orders import EscapeOrders, escape_orders
     from fitting.paper import TERMS, Quadrature, paper_terms
+    from fitting.radiometric import basis_tables, paper_terms_any, radiometric_terms
 
 _HOME = {
+    "BodyTrace": "body",
+    "Epidermis": "body",
+    "trace_body": "body",
     "CELL_AREA": "cells",
-    "Dome": "cells",
+    "Cell": "cells",
+    "Spread": "cells",
     "DomainError": "errors",
+    "EnergyError": "errors",
     "FitError": "errors",
     "ReadingError": "errors",
     "TableError": "errors",
@@ -26,25 +34,40 @@ _HOME = {
     "read_csv": "measurements",
     "MixtureFit": "mixture",
     "fit_mixture": "mixture",
+    "EscapeOrders": "orders",
+    "escape_orders": "orders",
     "TERMS": "paper",
     "Quadrature": "paper",
     "paper_terms": "paper",
+    "basis_tables": "radiometric",
+    "paper_terms_any": "radiometric",
+    "radiometric_terms": "radiometric",
 }
 
 __all__ = [
     "CELL_AREA",
     "TERMS",
+    "BodyTrace",
+    "Cell",
     "DomainError",
-    "Dome",
+    "Epidermis",
+    "EnergyError",
+    "EscapeOrders",
     "FitError",
     "Measurements",
     "MixtureFit",
     "Quadrature",
     "ReadingError",
+    "Spread",
     "TableError",
+    "basis_tables",
+    "escape_orders",
     "fit_mixture",
     "paper_terms",
+    "paper_terms_any",
+    "radiometric_terms",
     "read_csv",
+    "trace_body",
 ]
 
 

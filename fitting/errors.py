@@ -13,6 +13,10 @@ class DomainError(FitError):
     """A direction, a cell shape or a setting lies outside what the model describes."""
 
 
+class EnergyError(FitError):
+    """A reflectance would send back more light than falls on the petal."""
+
+
 class ReadingError(FitError):
     """One reading cannot be used.
 

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import functools
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fitting.cells import Dome
+from fitting.cells import Cell
 from fitting.errors import DomainError
 
 TERMS = ("u_diff", "u_spec", "s_diff", "s_spec")
@@ -24,6 +26,12 @@ LOBE_FLOOR = 1e-5
 
 SLICES_IN_LOBE = 8
 """Fewer slices than this across a lobe would miss it: trapezoid on a Gaussian cut at LOBE_FLOOR, error about 1e-4."""
+
+
+LOBE_SLICES = 377
+"""Slices for the specular lobe while light and view stay within LOW of the normal."""
+
+LOW = math.radians(70) + 1e-9
 
 
 @dataclass(frozen=True)
@@ -112,7 +120,7 @@ def paper_terms(
     """
     from fitting.slices import dome_terms  # numba
 
-    dome, rule = Dome(aspect), quadrature or Quadrature()
+    dome, rule = Cell(aspect), quadrature or Quadrature()
     for name, n in (("n_us", n_us), ("n_ss", n_ss)):
         if not (math.isfinite(n) and n > 0):
             raise DomainError(f"{name} must be a finite number above 0, not {n!r}")
@@ -121,19 +129,37 @@ def paper_terms(
     if len(windows) and 2 * windows[:, 2].min() * rule.slices / math.pi < SLICES_IN_LOBE:
         raise DomainError(f"the lobe of n_us = {n_us:g} on domes of aspect {aspect:g} falls between {rule.slices} slices: ask for more")
     angles, where = np.unique(np.concatenate([theta_i, theta_r]), return_inverse=True)
-    domes = dome_terms(
-        dome.stretch,
-        np.column_stack([np.sin(angles), np.cos(angles)]),
-        where.reshape(2, -1).T.copy(),
-        windows,
-        float(n_us),
-        rule.slices,
-        rule.generator,
-        *_gauss_legendre(rule.lobe),
-        neighbours,
-    )
+    towards, pairs = np.column_stack([np.sin(angles), np.cos(angles)]), where.reshape(2, -1).T.copy()
+    lobe = _rule_for_lobe(rule, angles, windows)
+    passes = [(rule, True, True)] if lobe == rule else [(rule, True, False), (lobe, False, True)]
+
+    def half(second: bool) -> NDArray[np.float64]:
+        domes = np.zeros((len(pairs), 2))
+        for r, diffuse, specular in passes:
+            middle, end = (r.slices + 1) // 4, (r.slices + 1) // 2
+            part = (middle, end) if second else (0, middle)
+            settings = (windows, float(n_us), r.slices, r.generator, *part, diffuse, specular, *_gauss_legendre(r.lobe), neighbours)
+            domes += dome_terms(dome.stretch, towards, pairs, *settings)
+        return domes
+
+    other = _second_thread(os.getpid()).submit(half, True)  # always two halves, so that the sum does not depend on the machine
+    domes = half(False) + other.result()
     mirror = np.maximum(0.0, np.cos(theta_i + theta_r))
     return np.column_stack([domes, np.cos(theta_i), mirror**n_ss])
+
+
+@functools.cache
+def _second_thread(process: int) -> ThreadPoolExecutor:
+    """Thread that takes half of the slices; kept, since starting one takes as long as 377 slices. A forked process starts its own."""
+    return ThreadPoolExecutor(1, f"slices-{process}")
+
+
+def _rule_for_lobe(rule: Quadrature, angles: NDArray[np.float64], windows: NDArray[np.float64]) -> Quadrature:
+    """Rule that suffices for the specular lobe, which needs fewer slices than the diffuse term's kinks unless light or view are low."""
+    if len(angles) == 0 or rule.slices <= LOBE_SLICES or np.abs(angles).max() > LOW:
+        return rule
+    few = Quadrature(LOBE_SLICES, rule.lobe)
+    return few if 2 * windows[:, 2].min() * few.slices / math.pi >= 3 * SLICES_IN_LOBE else rule
 
 
 @functools.cache

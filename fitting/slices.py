@@ -73,6 +73,21 @@ def reach(t: float, y: float, lattice: tuple[float, float, float, float], neighb
 
 
 @njit(cache=True, nogil=True)
+def power(x: float, exponent: float) -> float:
+    """Raise to a power; whole exponents, the usual ones, by squaring, several times quicker."""
+    whole = int(exponent)
+    if whole != exponent or whole > 4096:
+        return x**exponent
+    out = 1.0
+    while whole:
+        if whole & 1:
+            out *= x
+        x *= x
+        whole >>= 1
+    return out
+
+
+@njit(cache=True, nogil=True)
 def lobe_on_slice(
     low: float, high: float, y: float, k: float, light: Array, view: Array, exponent: float, nodes: Array, weights: Array
 ) -> float:
@@ -114,7 +129,7 @@ def lobe_on_slice(
         length2 = nx * nx + y * y + nz * nz
         cos_phi = 2 * (nx * light[0] + nz * light[1]) * (nx * view[0] + nz * view[1]) / length2 - light_view
         if cos_phi > 0:
-            total += weights[node] * cos_phi**exponent * k * math.sqrt(length2) * s / square
+            total += weights[node] * power(cos_phi, exponent) * k * math.sqrt(length2) * s / square
     return total * half
 
 
@@ -127,6 +142,10 @@ def dome_terms(
     exponent: float,
     slices: int,
     generator: int,
+    begin: int,
+    end: int,
+    diffuse: bool,
+    lobe: bool,
     nodes: Array,
     weights: Array,
     neighbours: bool,
@@ -147,6 +166,10 @@ def dome_terms(
         Of the specular lobe.
     slices, generator : int
         Size (odd) and generator of the Fibonacci lattice rule over (eta, azimuth).
+    begin, end : int
+        Share of the rule's (slices + 1) / 2 distinct nodes; shares add up.
+    diffuse, lobe : bool
+        Which of the two to integrate; the other is 0.
     nodes, weights : ndarray
         Gauss-Legendre rule on -1 .. 1 for the lobe along a slice.
     neighbours : bool
@@ -158,10 +181,17 @@ def dome_terms(
     """
     s = max(1.0, k)
     t = np.arctan2(k * towards[:, 0], towards[:, 1])
-    low, high = np.empty(len(t)), np.empty(len(t))
+    squeezed = np.hypot(k * towards[:, 0], towards[:, 1])
+    low, high = t - math.pi / 2, t + math.pi / 2
+    # The ends of the reach as tau; a rising function, so bounds may be compared before or after.
+    tau_low = np.arctan2(s * np.sin(low), np.cos(low))
+    tau_high = np.arctan2(s * np.sin(high), np.cos(high))
     out = np.zeros((len(pairs), 2))
-    for q in range((slices + 1) // 2):
+    widest = np.max(windows[:, 2]) if len(pairs) else 0.0
+    for q in range(begin, end):
         eta = math.pi * q / slices
+        if not diffuse and eta > widest:
+            break
         y, rho = math.sin(eta), math.cos(eta)
         turn = (q * generator % slices) / slices
         azimuth = (turn if turn < 0.5 else turn - 1) * math.pi / 3
@@ -171,21 +201,24 @@ def dome_terms(
         for d in range(len(t)):
             # The lattice is symmetric about the dome's centre: a direction from -x is one from +x with the slice on the other side.
             if t[d] >= 0:
-                low[d], high[d] = t[d] - math.pi / 2, t[d] + reach(t[d], y, lattice, neighbours)
+                high[d] = t[d] + reach(t[d], y, lattice, neighbours)
+                if lobe:
+                    tau_high[d] = math.atan2(s * math.sin(high[d]), math.cos(high[d]))
             else:
-                low[d], high[d] = t[d] - reach(-t[d], -y, lattice, neighbours), t[d] + math.pi / 2
+                low[d] = t[d] - reach(-t[d], -y, lattice, neighbours)
+                if lobe:
+                    tau_low[d] = math.atan2(s * math.sin(low[d]), math.cos(low[d]))
         for p in range(len(pairs)):
             i, r = pairs[p]
             first, last = max(low[i], low[r]), min(high[i], high[r])
             if first >= last:
                 continue
-            # N.L dA on the dome is k |L'| rho cos(psi - t) dpsi dy on the unit sphere, L' = (Lx, Lz / k).
-            squeezed = math.hypot(k * towards[i, 0], towards[i, 1])
-            out[p, 0] += weight * rho * squeezed * (math.sin(last - t[i]) - math.sin(first - t[i]))
-            if eta > windows[p, 2]:
-                continue
-            first = max(windows[p, 0], math.atan2(s * math.sin(first), math.cos(first)))
-            last = min(windows[p, 1], math.atan2(s * math.sin(last), math.cos(last)))
-            if first < last:
-                out[p, 1] += weight * lobe_on_slice(first, last, y, k, towards[i], towards[r], exponent, nodes, weights)
+            if diffuse:
+                # N.L dA on the dome is k |L'| rho cos(psi - t) dpsi dy on the unit sphere, L' = (Lx, Lz / k).
+                out[p, 0] += weight * rho * squeezed[i] * (math.sin(last - t[i]) - math.sin(first - t[i]))
+            if lobe and eta <= windows[p, 2]:
+                first = max(windows[p, 0], tau_low[i], tau_low[r])
+                last = min(windows[p, 1], tau_high[i], tau_high[r])
+                if first < last:
+                    out[p, 1] += weight * lobe_on_slice(first, last, y, k, towards[i], towards[r], exponent, nodes, weights)
     return out

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from fitting import CELL_AREA, DomainError, Dome, Quadrature, paper_terms
+from fitting import CELL_AREA, Cell, DomainError, Quadrature, paper_terms
 
 VIEWS = np.arange(-70, 71, 10)
 COARSE = Quadrature(377)
@@ -37,6 +37,23 @@ def test_within_half_a_percent_of_the_converged_values(aspect: float) -> None:
     for rule, tolerance in ((Quadrature(), 2e-3), (COARSE, 5e-3)):
         found = paper_terms(45, VIEWS, aspect=aspect, quadrature=rule)
         np.testing.assert_allclose(found[counts], converged[counts], rtol=tolerance)
+
+
+@given(theta_i=st.floats(0, 70), theta_r=st.floats(-70, 70), aspect=aspects)
+def test_the_lobe_needs_fewer_slices(theta_i: float, theta_r: float, aspect: float) -> None:
+    """By default it takes fewer than the diffuse term's kinks, while light and view stay off the petal: they change nothing."""
+    usual, fine = (paper_terms(theta_i, theta_r, aspect=aspect, quadrature=rule)[0, 1] for rule in (Quadrature(), Quadrature(4181, 24)))
+    assert usual == pytest.approx(fine, rel=1e-3, abs=1e-6)
+
+
+def test_halves_in_two_threads_are_the_whole() -> None:
+    """Whatever the threads do, a call repeats to the last bit, also from many callers at once."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    once = paper_terms(45, VIEWS, aspect=1.9)
+    with ThreadPoolExecutor(4) as pool:
+        for again in pool.map(lambda _: paper_terms(45, VIEWS, aspect=1.9), range(24)):
+            np.testing.assert_array_equal(again, once)
 
 
 @given(theta_i=incidences, theta_r=views)
@@ -163,10 +180,10 @@ def test_lobe_needs_nodes() -> None:
         Quadrature(377, 1)
 
 
-def test_dome() -> None:
-    assert Dome(1.9).stretch == pytest.approx(3.8)
-    assert math.degrees(float(Dome(0.5).sphere_angle(math.radians(30)))) == pytest.approx(30)
-    assert math.tan(float(Dome(1.9).sphere_angle(math.radians(45)))) == pytest.approx(3.8)
+def test_cell() -> None:
+    assert Cell(1.9).stretch == pytest.approx(3.8)
+    assert math.degrees(float(Cell(0.5).sphere_angle(math.radians(30)))) == pytest.approx(30)
+    assert math.tan(float(Cell(1.9).sphere_angle(math.radians(45)))) == pytest.approx(3.8)
 
 
 def test_importing_the_package_loads_nothing_slow() -> None:

@@ -59,7 +59,9 @@ def terms(theta_i: float, theta_r: float, k: float, generator: int) -> np.ndarra
     angles = np.radians([theta_i, theta_r])
     towards = np.column_stack([np.sin(angles), np.cos(angles)])
     whole = np.array([[-np.pi / 2, np.pi / 2, np.pi / 2]])
-    return dome_terms(k, towards, np.array([[0, 1]]), whole, 40.0, 89, generator, *np.polynomial.legendre.leggauss(24), True)[0]
+    return dome_terms(
+        k, towards, np.array([[0, 1]]), whole, 40.0, 89, generator, 0, 45, True, True, *np.polynomial.legendre.leggauss(24), True
+    )[0]
 
 
 angle = st.floats(-85, 85)
