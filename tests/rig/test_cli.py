@@ -186,6 +186,22 @@ def test_cultivars_are_added_and_listed(rig) -> None:
     assert "rig init" in rig("sweep", "--cultivar", "YR", check=2).stderr
 
 
+def test_model_eval_knows_other_cells_and_directions(rig) -> None:
+    def one(*options: str) -> dict[str, float]:
+        (row,) = csv.DictReader(io.StringIO(rig("model", "eval", "--phi", "60", *options).stdout))
+        return {name: float(value) for name, value in row.items()}
+
+    papilla = ("--aspect", "1.2", "--p", "1.4", "--q", "1.7", "--gap", "0.1")
+    there = one("--mode", "radiometric", "--theta-i", "20", "--theta-r", "50", *papilla)
+    back = one("--mode", "radiometric", "--theta-i", "50", "--theta-r", "20", *papilla)
+    assert there.pop("theta_r_deg") == 50
+    assert back.pop("theta_r_deg") == 20
+    assert there == pytest.approx(back)  # reciprocal
+    assert list(there) == ["diff", "spec"]
+    assert 0 < there["diff"] < 1 / 3.14
+    assert one("--theta-r", "50", *papilla)["s_diff"] == pytest.approx(0.5**0.5, rel=1e-5)
+
+
 def test_model_eval_writes_csv(rig) -> None:
     rows = list(csv.DictReader(io.StringIO(rig("model", "eval", "--mode", "paper", "--theta-i", "45", "--theta-r", "-70:70:10").stdout)))
     assert list(rows[0]) == ["theta_r_deg", "u_diff", "u_spec", "s_diff", "s_spec"]
