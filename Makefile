@@ -40,7 +40,7 @@ petals: use
 LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
 lock:
 	$(LOCK) pyproject.toml -o requirements.lock
-	$(LOCK) --extra test --extra viewer pyproject.toml tests/peers.in -c requirements.lock -o tests/requirements.lock
+	$(LOCK) --extra test --extra viewer --extra photoreal pyproject.toml tests/peers.in -c requirements.lock -o tests/requirements.lock
 	$(LOCK) --no-deps tests/peers-nodeps.in >> tests/requirements.lock
 
 clean:

@@ -14,9 +14,13 @@ if TYPE_CHECKING:
     from fitting.errors import DomainError, EnergyError, FitError, ReadingError, TableError
     from fitting.measurements import Measurements, read_csv
     from fitting.mixture import MixtureFit, fit_mixture
+    from fitting.model import Model
     from fitting.orders import EscapeOrders, escape_orders
     from fitting.paper import TERMS, Quadrature, paper_terms
-    from fitting.radiometric import basis_tables, paper_terms_any, radiometric_terms
+    from fitting.radiometric import Sampling, basis_tables, paper_terms_any, radiometric_terms
+    from fitting.reflectance import Reflectance
+    from fitting.scattering import Scattering
+    from fitting.table import Grid, ReflectanceTable, paper_table, radiometric_table
 
 _HOME = {
     "BodyTrace": "body",
@@ -34,14 +38,22 @@ _HOME = {
     "read_csv": "measurements",
     "MixtureFit": "mixture",
     "fit_mixture": "mixture",
+    "Model": "model",
     "EscapeOrders": "orders",
     "escape_orders": "orders",
     "TERMS": "paper",
     "Quadrature": "paper",
     "paper_terms": "paper",
+    "Sampling": "radiometric",
     "basis_tables": "radiometric",
     "paper_terms_any": "radiometric",
     "radiometric_terms": "radiometric",
+    "Reflectance": "reflectance",
+    "Scattering": "scattering",
+    "Grid": "table",
+    "ReflectanceTable": "table",
+    "paper_table": "table",
+    "radiometric_table": "table",
 }
 
 __all__ = [
@@ -54,17 +66,25 @@ __all__ = [
     "Epidermis",
     "EscapeOrders",
     "FitError",
+    "Grid",
     "Measurements",
     "MixtureFit",
+    "Model",
     "Quadrature",
     "ReadingError",
+    "Reflectance",
+    "ReflectanceTable",
+    "Sampling",
+    "Scattering",
     "Spread",
     "TableError",
     "basis_tables",
     "escape_orders",
     "fit_mixture",
+    "paper_table",
     "paper_terms",
     "paper_terms_any",
+    "radiometric_table",
     "radiometric_terms",
     "read_csv",
     "trace_body",

@@ -28,6 +28,7 @@ from typing import Any, Required, TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fitting.cells import Cell
 from fitting.errors import DomainError
 
 Array = NDArray[np.float64]
@@ -37,6 +38,8 @@ THETA: tuple[float, ...] = (*range(86), *(86 + i / 2 for i in range(9)))
 STREAMS = 16
 STRAY = (10, 7)
 """Nodes of the angle in air, 0 to 90 deg, and of the azimuth, 0 to 180 deg, for the directions of stray light."""
+CHUNK = 512
+"""Directions whose mirror light a thread works out at a time."""
 EDGES = (0.0, *(0.02 * 3000 ** (i / 30) for i in range(31)))
 """Lower bounds of the bins of path, a."""
 
@@ -47,42 +50,25 @@ class Epidermis:
 
     Parameters
     ----------
-    aspect : float
-        Height over base diameter of the domes, h / 2a; 0 is a flat face.
-    p, q : float
-        Profile z = h (1 - (r/a)^p)^(1/q), both at least 1; 2 and 2 is an ellipsoid.
-    gap : float
-        Flat floor between neighbours' rims over base diameter: pitch 2a (1 + gap).
+    cell : Cell or None
+        Its domes, all alike; None is a flat face.
     depth : float
         Pigmented slab below the domes, a. The default is one base radius [U].
 
     Raises
     ------
     DomainError
-        If a number is not finite or out of its range.
+        If the depth is not a finite number of 0 or more, or the domes differ.
     """
 
-    aspect: float = 0.5
-    p: float = 2.0
-    q: float = 2.0
-    gap: float = 0.0
+    cell: Cell | None = field(default_factory=Cell)
     depth: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, least in (("aspect", 0.0), ("p", 1.0), ("q", 1.0), ("gap", 0.0), ("depth", 0.0)):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= least):
-                raise DomainError(f"an epidermis' {name} must be a finite number of at least {least:g}, not {value!r}")
-
-    @property
-    def height(self) -> float:
-        """Of the domes, a."""
-        return 2 * self.aspect
-
-    @property
-    def pitch(self) -> float:
-        """Of the packing, a."""
-        return 2 * (1 + self.gap)
+        if not (math.isfinite(self.depth) and self.depth >= 0):
+            raise DomainError(f"an epidermis' depth must be a finite number of 0 or more, not {self.depth!r}")
+        if self.cell is not None and not self.cell.spread.is_none:
+            raise DomainError(f"body light is traced for domes that are all alike, not for {self.cell.spread}; take a cell without spread")
 
 
 @dataclass(frozen=True)
@@ -286,18 +272,21 @@ class BodyTrace:
         ----------
         Torrance and Sparrow 1967, doi:10.1364/JOSA.57.001105; Walter et al. 2007, doi:10.2312/EGWR/EGSR07/195-206, eq. 20.
         """
-        from fitting.tracing import mirror
+        from fitting.tracing import Domes, mirror, on_all_cores
 
-        cell = self.upper.epidermis
+        cell = self.upper.epidermis.cell
         i, r = _angles(theta_i, theta_r)
         i, r, azimuth = np.broadcast_arrays(np.radians(i), np.radians(r), np.radians(np.asarray(phi, float)))
-        if cell.height == 0:
+        if cell is None:
             return np.zeros(i.shape)
         if cell.p == cell.q == 1:
             raise DomainError("straight cones (p = q = 1) mirror light into sheets without width, not in 1/sr; take q = 1.05 or so")
         wi = np.stack([np.sin(i), np.zeros(i.shape), np.cos(i)], -1).reshape(-1, 3)
         wo = np.stack([np.sin(r) * np.cos(azimuth), np.sin(r) * np.sin(azimuth), np.cos(r)], -1).reshape(-1, 3)
-        value = mirror(wi, wo, cell.height, cell.p, cell.q, cell.pitch, self.upper.n, turns).reshape(i.shape)
+        domes = Domes.of(cell)
+        parts = [slice(first, first + CHUNK) for first in range(0, len(wi), CHUNK)]
+        values = on_all_cores(lambda k: mirror(wi[parts[k]], wo[parts[k]], domes, self.upper.n, turns), len(parts))
+        value = np.concatenate([*values, np.empty(0)]).reshape(i.shape)
         if not np.all(np.isfinite(value)):
             raise DomainError(f"domes with p = {cell.p:g} are flat at the top: at theta_r = -theta_i their mirror light is not finite")
         return np.asarray(value)
@@ -395,8 +384,9 @@ class BodyTrace:
         """Everything as named arrays, for a file (`numpy.savez`); `from_arrays` reads them."""
         found: dict[str, Array] = {}
         for name, face in (("upper", self.upper), ("lower", self.lower)):
-            cell = face.epidermis
-            found[f"{name}.numbers"] = np.array([cell.aspect, cell.p, cell.q, cell.gap, cell.depth, face.n, face.closure, face.lost])
+            cell = face.epidermis.cell
+            domes = (cell.aspect, cell.p, cell.q, cell.gap) if cell else (0.0, 2.0, 2.0, 0.0)
+            found[f"{name}.numbers"] = np.array([*domes, face.epidermis.depth, face.n, face.closure, face.lost])
             found |= {f"{name}.single": face.single, f"{name}.floor": face.floor, f"{name}.stray": face.stray}
             for part in ("down", "back", "astray"):
                 paths: Paths = getattr(face, part)
@@ -423,10 +413,11 @@ class BodyTrace:
                 if key not in arrays or arrays[key].shape != shape:
                     found = arrays[key].shape if key in arrays else "nothing"
                     raise DomainError(f"not a traced petal: {key} should have shape {shape}, found {found}; trace it again")
-            numbers = [float(x) for x in arrays[f"{name}.numbers"]]
+            aspect, p, q, gap, depth, n, closure, lost = (float(x) for x in arrays[f"{name}.numbers"])
             paths = {part: Paths(arrays[f"{name}.{part}.weights"], arrays[f"{name}.{part}.lengths"]) for part in shapes}
             rest = {part: arrays[f"{name}.{part}"] for part in ("stray", "single", "floor")}
-            faces.append(Face(Epidermis(*numbers[:5]), numbers[5], **paths, **rest, closure=numbers[6], lost=numbers[7]))  # type: ignore[arg-type]
+            epidermis = Epidermis(Cell(aspect, p, q, gap) if aspect else None, depth)
+            faces.append(Face(epidermis, n, **paths, **rest, closure=closure, lost=lost))  # type: ignore[arg-type]
         return cls(faces[0], faces[1], provenance or {})
 
     def _streams(self, options: dict[str, float], theta: Array) -> _Streams:
@@ -474,32 +465,33 @@ def trace_body(upper: Epidermis, lower: Epidermis | None = None, *, n: float = 1
         raise DomainError(f"the refractive index must be a finite number above 1, not {n!r}")
     if rays < 64 or rays & (rays - 1):
         raise DomainError(f"rays must be a power of 2 from 64 on, not {rays}")
-    below = Epidermis(aspect=0.0, depth=upper.depth) if lower is None else lower
-    faces = {cell: trace_face(cell, n, rays, seed) for cell in {upper, below}}
+    below = Epidermis(None, upper.depth) if lower is None else lower
+    faces = {face: trace_face(face, n, rays, seed) for face in {upper, below}}
     return BodyTrace(faces[upper], faces[below], {"n": n, "rays": rays, "seed": seed})
 
 
-def trace_face(cell: Epidermis, n: float, rays: int, seed: int) -> Face:
+def trace_face(epidermis: Epidermis, n: float, rays: int, seed: int) -> Face:
     """Trace one face; parameters and errors as for `trace_body`."""
     from scipy.stats import qmc
 
-    from fitting import tracing
+    from fitting.tracing import Domes, Layer, Tally, on_all_cores, trace_down, trace_up
 
     rng = np.random.default_rng(seed)
-    edges = np.array(EDGES)
-    shape = (cell.height, cell.p, cell.q, cell.pitch, cell.depth, n, edges, STREAMS)
+    layer = Layer(Domes.of(epidermis.cell), float(epidermis.depth), float(n), np.array(EDGES))
     points = qmc.Sobol(4, seed=rng).random(rays)
     shifts = rng.random((len(THETA), 4))
     theta = _incidences((points[:, 3] + shifts[:, 3:]) % 1)
-    reached, escaped, shares, stray = tracing.trace_down(theta, points[:, :3].copy(), shifts[:, :3].copy(), seed, *shape, STRAY)
-    kept_down = rays - shares[:, 2]
-    kept = kept_down[:, None, None, None]
-    down, astray, turned = reached / kept, escaped / kept[..., 0], shares[:, :2] / kept[..., 0, 0]
+    above = Tally.empty(len(THETA), STREAMS, len(EDGES), (STRAY[0], *STRAY))
+    on_all_cores(lambda k: trace_down(theta[k], points, shifts[k], seed + k, layer, above.row(k)), len(THETA))
+    lost = above.shares[:, 2]
+    kept = (rays - lost)[:, None, None, None]
+    down, astray, turned = above.reached / kept, above.escaped / kept[..., 0], above.shares[:, :2] / kept[..., 0, 0]
 
-    points, shifts = qmc.Sobol(4, seed=rng).random(4 * rays), rng.random((STREAMS, 4))
-    reached, escaped, rest = tracing.trace_up(points, shifts, seed, *shape)
-    kept = 4 * rays - rest[:, 2]
-    back = reached / kept[:, None, None, None]
+    points_up, shifts_up = qmc.Sobol(4, seed=rng).random(4 * rays), rng.random((STREAMS, 4))
+    below = Tally.empty(STREAMS, STREAMS, len(EDGES))
+    on_all_cores(lambda k: trace_up(k, points_up, shifts_up[k], seed + k, layer, below.row(k)), STREAMS)
+    lost_up = below.shares[:, 2]
+    back = below.reached / (4 * rays - lost_up)[:, None, None, None]
     back = (back + back.swapaxes(0, 1)) / 2
     stays = 1 - STREAMS / n**2 * (hat_weights() @ down[..., 0].sum(-1))
     if stays.min() <= 0:
@@ -507,16 +499,16 @@ def trace_face(cell: Epidermis, n: float, rays: int, seed: int) -> Face:
     scale = _balance(back[..., 0].sum(-1), stays)
     back *= (scale[:, None] * scale)[..., None, None]
     return Face(
-        epidermis=cell,
+        epidermis=epidermis,
         n=n,
         down=gauss(down),
         back=gauss(back),
         astray=gauss(astray),
-        stray=_radiance(np.einsum("k,kirp->irp", hat_weights() / kept_down, stray)),
+        stray=_radiance(np.einsum("k,kirp->irp", hat_weights() / (rays - lost), above.stray)),
         single=turned[:, 0],
         floor=turned[:, 1],
         closure=float(np.abs((scale**2 - 1) * stays).max()),
-        lost=float(max(shares[:, 2].max() / rays, rest[:, 2].max() / (4 * rays))),
+        lost=float(max(lost.max() / rays, lost_up.max() / (4 * rays))),
     )
 
 

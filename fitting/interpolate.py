@@ -184,7 +184,17 @@ def _plane(flat: Singles, at: np.uint64, step: np.uint64, r: Four, p: Four) -> n
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def look_up(table: Singles, axis_i: Axis, axis_r: Axis, axis_p: Axis, theta_i: Array, theta_r: Array, phi: Array, out: Array) -> int:
+def look_up(
+    table: Singles,
+    axis_i: Axis,
+    axis_r: Axis,
+    axis_p: Axis,
+    reciprocal: bool,
+    theta_i: Array,
+    theta_r: Array,
+    phi: Array,
+    out: Array,
+) -> int:
     """Evaluate a tensor spline at directions above the petal.
 
     Parameters
@@ -193,6 +203,8 @@ def look_up(table: Singles, axis_i: Axis, axis_r: Axis, axis_p: Axis, theta_i: A
         `coefficients`.
     axis_i, axis_r, axis_p : Axis
         Its axes. Beyond the last node the value at the last node is taken.
+    reciprocal : bool
+        Whether light and view may be swapped: the lower of the two is then taken for the light, so that both ways round give the same bits.
     theta_i, theta_r, phi : ndarray, shape (n,), deg
         0 to 90; -90 to 90, below 0 being the view at -theta_r and phi + 180; any finite angle, left and right alike.
     out : ndarray, shape (n,)
@@ -212,6 +224,8 @@ def look_up(table: Singles, axis_i: Axis, axis_r: Axis, axis_p: Axis, theta_i: A
         azimuth = abs(azimuth - 360 * np.floor(azimuth / 360 + 0.5))
         if tr < 0:
             tr, azimuth = -tr, 180 - azimuth
+        if reciprocal:
+            ti, tr = min(ti, tr), max(ti, tr)
         i, u = _place(axis_i, 90 - math.sqrt(90 * (90 - min(ti, axis_i.last))))
         j, v = _place(axis_r, 90 - math.sqrt(90 * (90 - min(tr, axis_r.last))))
         k, w = _place(axis_p, min(max(azimuth, 0.0), axis_p.last))

@@ -144,8 +144,24 @@ def paper_terms(
 
     other = _second_thread(os.getpid()).submit(half, True)  # always two halves, so that the sum does not depend on the machine
     domes = half(False) + other.result()
-    mirror = np.maximum(0.0, np.cos(theta_i + theta_r))
-    return np.column_stack([domes, np.cos(theta_i), mirror**n_ss])
+    return np.column_stack([domes, flat_spongy(np.cos(theta_i), np.cos(theta_i + theta_r), n_ss)])
+
+
+def flat_spongy(cos_i: NDArray[np.float64], mirrored: NDArray[np.float64], n_ss: float) -> NDArray[np.float64]:
+    """r'_s_diff and r'_s_spec, eqs. (5) and (6), of a flat boundary, lit and seen unhindered.
+
+    Parameters
+    ----------
+    cos_i, mirrored : ndarray, shape (n,)
+        cos(theta_i), and R.V, below 0 away from the mirror direction.
+    n_ss : float
+        Exponent of the lobe.
+
+    Returns
+    -------
+    ndarray, shape (n, 2), 1/1
+    """
+    return np.column_stack([cos_i, np.maximum(0.0, mirrored) ** n_ss])
 
 
 @functools.cache
@@ -185,7 +201,7 @@ def _in_plane(theta_i_deg: ArrayLike, theta_r_deg: ArrayLike) -> tuple[NDArray[n
 
 
 def _lobe_windows(theta_i: NDArray[np.float64], theta_r: NDArray[np.float64], k: float, exponent: float) -> NDArray[np.float64]:
-    """Bound the part of a dome whose specular lobe exceeds LOBE_FLOOR; columns lowest tau, highest tau, largest abs(eta), rad.
+    """Bound the part of a dome whose specular lobe exceeds LOBE_FLOOR; columns lowest psi, highest psi, largest abs(eta), rad.
 
     With the normal at chi from the half direction in the plane and at beta out of it, and D = theta_i - theta_r, eqs. (3) and (4) give
     R.V = cos^2(beta) cos(2 chi) - sin^2(beta) cos(D).
@@ -201,5 +217,4 @@ def _lobe_windows(theta_i: NDArray[np.float64], theta_r: NDArray[np.float64], k:
     most = np.where((low < 0) & (high > 0), 1.0, ends.max(axis=0))
     squash = np.sqrt(np.minimum(*(k * k * c + 1 - c for c in (most, ends.min(axis=0)))))
     eta = np.arctan2(np.sqrt(tilt), squash * np.sqrt(1 - tilt))
-    s = max(1.0, k)
-    return np.column_stack([*(np.arctan2(s * np.sin(chi), k * np.cos(chi)) for chi in (low, high)), eta])
+    return np.column_stack([*(np.arctan2(np.sin(chi), k * np.cos(chi)) for chi in (low, high)), eta])

@@ -21,12 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fitting.cells import Cell
 from fitting.errors import DomainError
-
-BASES = ("diff", "spec")
-"""Columns of `radiometric_terms`."""
-
-LOBE_FLOOR = 1e-5
-"""The specular lobe is cut off where it falls below this fraction of its peak."""
+from fitting.paper import LOBE_FLOOR, TERMS, flat_spongy
 
 Array = NDArray[np.float64]
 
@@ -67,9 +62,10 @@ def radiometric_terms(
     *,
     cell: Cell | None = None,
     n_us: float = 40.0,
+    n_ss: float = 5.0,
     sampling: Sampling | None = None,
 ) -> Array:
-    """Evaluate the single-bounce reflectance of facets that are diffuse (1 / pi) or a lobe ((n + 2) / (2 pi) max(0, R.V)^n).
+    """Evaluate the single-bounce reflectance of tissues that are diffuse (1 / pi) or a lobe ((n + 2) / (2 pi) max(0, R.V)^n).
 
     Parameters
     ----------
@@ -81,30 +77,31 @@ def radiometric_terms(
         phi_r - phi_i, 0 on the light's side. The three broadcast against one another.
     cell : Cell, optional
         Shape of the domes.
-    n_us : float
-        Exponent of the lobe.
+    n_us, n_ss : float
+        Exponents of the lobes of the epidermis, domes and floor, and of the flat spongy tissue.
     sampling : Sampling, optional
         How finely.
 
     Returns
     -------
-    ndarray, shape (n, 2), 1/sr
-        Columns `BASES`; domes and floor, seen by a detector that sees the patch only.
+    ndarray, shape (n, 4), 1/sr
+        Columns `fitting.paper.TERMS`, seen by a detector that sees the patch only.
 
     Raises
     ------
     DomainError
-        If a direction or the exponent is outside the model.
+        If a direction or an exponent is outside the model.
 
     Notes
     -----
     f_r = (1 / alpha) Int l v f max(0, N.L) max(0, N.V) dp / (cos theta_i cos theta_r), the lattice averaged over its azimuth.
     """
     cell = cell or Cell()
-    _exponents(n_us=n_us)
+    _exponents(n_us=n_us, n_ss=n_ss)
     theta_i, theta_r, phi = _directions(theta_i_deg, theta_r_deg, phi_deg)
     sums = _sums(cell, theta_i, theta_r, phi, n_us, sampling or Sampling(), foreshortened=True)
-    return sums * [1 / np.pi, (n_us + 2) / (2 * np.pi)] / (np.cos(theta_i) * np.cos(theta_r))[:, None]
+    sums *= [1 / np.pi, (n_us + 2) / (2 * np.pi)] / (np.cos(theta_i) * np.cos(theta_r))[:, None]
+    return np.column_stack([sums, flat_spongy_per_sr(_mirrored(theta_i, theta_r, phi), n_ss)])
 
 
 def paper_terms_any(
@@ -141,8 +138,24 @@ def paper_terms_any(
     _exponents(n_us=n_us, n_ss=n_ss)
     theta_i, theta_r, phi = _directions(theta_i_deg, theta_r_deg, phi_deg)
     sums = _sums(cell, theta_i, theta_r, phi, n_us, sampling or Sampling(), foreshortened=False)
-    mirror = np.cos(theta_i) * np.cos(theta_r) - np.sin(theta_i) * np.sin(theta_r) * np.cos(phi)
-    return np.column_stack([sums, np.cos(theta_i), np.maximum(0.0, mirror) ** n_ss])
+    return np.column_stack([sums, flat_spongy(np.cos(theta_i), _mirrored(theta_i, theta_r, phi), n_ss)])
+
+
+def flat_spongy_per_sr(mirrored: Array, n_ss: float) -> Array:
+    """s_diff and s_spec of a flat boundary, lit and seen unhindered.
+
+    Parameters
+    ----------
+    mirrored : ndarray, shape (n,)
+        R.V, below 0 away from the mirror direction.
+    n_ss : float
+        Exponent of the lobe.
+
+    Returns
+    -------
+    ndarray, shape (n, 2), 1/sr
+    """
+    return np.column_stack([np.full(len(mirrored), 1 / np.pi), (n_ss + 2) / (2 * np.pi) * np.maximum(0.0, mirrored) ** n_ss])
 
 
 def basis_tables(
@@ -172,7 +185,7 @@ def basis_tables(
     Returns
     -------
     dict of str to ndarray, shape (i, r, p)
-        `BASES`, or `fitting.paper.TERMS`.
+        `fitting.paper.TERMS`.
 
     Raises
     ------
@@ -182,16 +195,14 @@ def basis_tables(
     nodes = [np.atleast_1d(np.asarray(a, float)) for a in (theta_i_deg, theta_r_deg, phi_deg)]
     directions = np.meshgrid(*nodes, indexing="ij")
     shape = directions[0].shape
-    names: tuple[str, ...]
     if mode == "radiometric":
-        terms, names = radiometric_terms(*directions, cell=cell, n_us=n_us, sampling=sampling), BASES
+        evaluate = radiometric_terms
     elif mode == "paper":
-        from fitting.paper import TERMS
-
-        terms, names = paper_terms_any(*directions, cell=cell, n_us=n_us, n_ss=n_ss, sampling=sampling), TERMS
+        evaluate = paper_terms_any
     else:
         raise DomainError(f"mode must be 'radiometric' or 'paper', not {mode!r}")
-    return {name: np.ascontiguousarray(column.reshape(shape)) for name, column in zip(names, terms.T, strict=True)}
+    terms = evaluate(*directions, cell=cell, n_us=n_us, n_ss=n_ss, sampling=sampling)
+    return {name: np.ascontiguousarray(column.reshape(shape)) for name, column in zip(TERMS, terms.T, strict=True)}
 
 
 def _exponents(**exponents: float) -> None:
@@ -218,6 +229,11 @@ def _directions(theta_i_deg: ArrayLike, theta_r_deg: ArrayLike, phi_deg: ArrayLi
     turned = np.where(theta_r < 0, phi + 180, phi)
     # Rounded, so that one phi written in two ways shares its horizons; left and right are alike.
     return np.radians(theta_i), np.radians(np.abs(theta_r)), np.radians(np.round(np.abs((turned + 180) % 360 - 180), 10))
+
+
+def _mirrored(theta_i: Array, theta_r: Array, phi: Array) -> Array:
+    """Cosine of the angle between a view and the mirror direction of a flat patch, R.V."""
+    return np.asarray(np.cos(theta_i) * np.cos(theta_r) - np.sin(theta_i) * np.sin(theta_r) * np.cos(phi))
 
 
 def _facets(cell: Cell, points: int, turns: int, floor: bool) -> tuple[tuple[NDArray[Any], ...], float]:

@@ -4,6 +4,8 @@ Why slices. Dividing z by k = h / a turns the domes into unit hemispheres and ke
 a ray never leaves the plane y = const it starts in, and in that plane the domes are half circles standing on a line. There, what one
 direction reaches of a half circle is a single interval of the polar angle psi, found exactly. Light and view together reach the overlap of
 two such intervals. Over psi the diffuse term has a closed form and the specular lobe is smooth, so nothing is sampled as lit or dark.
+All ends of intervals lie within -pi / 2 .. pi / 2, where the sine rises: angles are kept as sine and cosine, and no slice needs a
+trigonometric function.
 
 What remains is the mean over the slice's place y = sin(eta) and the lattice's azimuth, on a two-dimensional Fibonacci lattice rule. The
 lattice repeats every 60 deg, and turning a slice over (y, azimuth -> -y, -azimuth) changes nothing, so half of the nodes are enough.
@@ -25,13 +27,13 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
-def reach(t: float, y: float, lattice: tuple[float, float, float, float], neighbours: bool) -> float:
-    """Largest angle from the beam's direction at which it still reaches a slice of a unit hemisphere.
+def reach(sin_t: float, cos_t: float, y: float, lattice: tuple[float, float, float, float], neighbours: bool) -> float:
+    """Largest angle from the beam's direction at which it still reaches a slice of a unit hemisphere, as its sine.
 
     Parameters
     ----------
-    t : float, rad
-        Angle of the direction from z towards +x, 0 <= t <= pi / 2.
+    sin_t, cos_t : float
+        Of the direction's angle from z towards +x, 0 <= t <= pi / 2.
     y : float
         Place of the slice, -1 < y < 1.
     lattice : tuple of float
@@ -41,8 +43,8 @@ def reach(t: float, y: float, lattice: tuple[float, float, float, float], neighb
 
     Returns
     -------
-    float, rad
-        psi - t at the edge of the shadow; pi / 2 - t, the rim of the dome, where no shadow falls.
+    float
+        sin(psi - t) at the edge of the shadow; cos(t), the rim of the dome, where no shadow falls.
 
     Notes
     -----
@@ -50,9 +52,8 @@ def reach(t: float, y: float, lattice: tuple[float, float, float, float], neighb
     neighbour's circle, ahead at x, begins at x cos(t) - rho_x and hides all beyond: the domes stand on the ground and do not overlap.
     """
     rho = math.sqrt(1 - y * y)
-    cos_t = math.cos(t)
     edge = rim = rho * cos_t
-    if neighbours:
+    if neighbours and sin_t > 0:
         # Column i of centres crosses the strip within 1 of the slice around x = start + i pitch, give or take the spread.
         x1, y1, x2, y2 = lattice
         pitch = CELL_AREA / y2
@@ -64,12 +65,13 @@ def reach(t: float, y: float, lattice: tuple[float, float, float, float], neighb
             off = i * y1 + j * y2 - y
             while off < 1:
                 x = i * x1 + j * x2
-                if x > 0:
-                    edge = min(edge, x * cos_t - math.sqrt(max(0.0, 1 - off * off)))
+                over = x * cos_t - edge  # what must be less than the neighbour's half width
+                if x > 0 and (over <= 0 or over * over < 1 - off * off):
+                    edge = x * cos_t - math.sqrt(max(0.0, 1 - off * off))
                 j += 1
                 off += y2
             i += 1
-    return math.pi / 2 - t if edge == rim else math.asin(max(-1.0, edge / rho))
+    return cos_t if edge == rim else max(-1.0, edge / rho)
 
 
 @njit(cache=True, nogil=True)
@@ -89,15 +91,24 @@ def power(x: float, exponent: float) -> float:
 
 @njit(cache=True, nogil=True)
 def lobe_on_slice(
-    low: float, high: float, y: float, k: float, light: Array, view: Array, exponent: float, nodes: Array, weights: Array
+    sin_1: float,
+    cos_1: float,
+    sin_2: float,
+    cos_2: float,
+    y: float,
+    k: float,
+    light: Array,
+    view: Array,
+    exponent: float,
+    nodes: Array,
+    weights: Array,
 ) -> float:
     """Integrate the specular lobe, eqs. (2) to (4), over the area of a dome along a slice.
 
     Parameters
     ----------
-    low, high : float, rad
-        Bounds of tau, the angle in which the lobe is smooth: that of the normal in the x-z plane for tall domes (k > 1), the polar angle
-        psi for flat ones; tan(tau) = max(1, k) tan(psi).
+    sin_1, cos_1, sin_2, cos_2 : float
+        Of the polar angle psi where the integral begins and ends, within -pi / 2 .. pi / 2.
     y : float
         Place of the slice.
     k : float
@@ -113,24 +124,39 @@ def lobe_on_slice(
     -------
     float
         Per unit of y, in a^2.
+
+    Notes
+    -----
+    The lobe is smooth over tau, the angle of the normal in the x-z plane for tall domes (k > 1), psi for flat ones:
+    tan(tau) = max(1, k) tan(psi). The rule runs over u = tan((tau - middle) / 2), of which sine and cosine are rational.
     """
-    rho = math.sqrt(1 - y * y)
     s = max(1.0, k)
-    middle, half = (low + high) / 2, (high - low) / 2
+    long_1, long_2 = math.sqrt(s * s * sin_1 * sin_1 + cos_1 * cos_1), math.sqrt(s * s * sin_2 * sin_2 + cos_2 * cos_2)
+    sin_1, cos_1, sin_2, cos_2 = s * sin_1 / long_1, cos_1 / long_1, s * sin_2 / long_2, cos_2 / long_2
+    # Sum and difference of the two unit vectors: along the middle and across it, 2 cos and 2 sin of half the angle between them.
+    along, across = math.hypot(sin_1 + sin_2, cos_1 + cos_2), math.hypot(sin_2 - sin_1, cos_2 - cos_1)
+    if along > across:
+        sin_m, cos_m = (sin_1 + sin_2) / along, (cos_1 + cos_2) / along
+    else:
+        sin_m, cos_m = (cos_1 - cos_2) / across, (sin_2 - sin_1) / across
+    span = across / (2 + along)
+    rho2, y2 = 1 - y * y, y * y
     light_view = light[0] * view[0] + light[1] * view[1]
     total = 0.0
     for node in range(len(nodes)):
-        tau = middle + half * nodes[node]
-        sin, cos = math.sin(tau), s * math.cos(tau)
+        u = span * nodes[node]
+        whole = 1 / (1 + u * u)
+        sin_d, cos_d = 2 * u * whole, (1 - u * u) * whole
+        sin, cos = sin_m * cos_d + cos_m * sin_d, s * (cos_m * cos_d - sin_m * sin_d)
         square = sin * sin + cos * cos
-        scale = rho / math.sqrt(square)
-        # (nx, y, nz) is normal to the dome; its length times k is the dome's area per area of the unit sphere.
-        nx, nz = scale * sin, scale * cos / k
-        length2 = nx * nx + y * y + nz * nz
-        cos_phi = 2 * (nx * light[0] + nz * light[1]) * (nx * view[0] + nz * view[1]) / length2 - light_view
+        up = cos / k
+        # rho / sqrt(square) (sin, ., up) and y are normal to the dome; its length times k is the dome's area per area of the unit sphere.
+        scale2 = rho2 / square
+        length2 = scale2 * (sin * sin + up * up) + y2
+        cos_phi = 2 * scale2 * (sin * light[0] + up * light[1]) * (sin * view[0] + up * view[1]) / length2 - light_view
         if cos_phi > 0:
-            total += weights[node] * power(cos_phi, exponent) * k * math.sqrt(length2) * s / square
-    return total * half
+            total += weights[node] * whole * power(cos_phi, exponent) * math.sqrt(length2) / square
+    return 2 * span * k * s * total
 
 
 @njit(cache=True, nogil=True)
@@ -161,7 +187,7 @@ def dome_terms(
     pairs : ndarray of int, shape (p, 2)
         Rows of `towards`: light, view.
     windows : ndarray, shape (p, 3), rad
-        Where the specular lobe counts: lowest and highest tau, largest abs(eta).
+        Where the specular lobe counts: lowest and highest psi, largest abs(eta).
     exponent : float
         Of the specular lobe.
     slices, generator : int
@@ -179,13 +205,13 @@ def dome_terms(
     -------
     ndarray, shape (p, 2)
     """
-    s = max(1.0, k)
-    t = np.arctan2(k * towards[:, 0], towards[:, 1])
     squeezed = np.hypot(k * towards[:, 0], towards[:, 1])
-    low, high = t - math.pi / 2, t + math.pi / 2
-    # The ends of the reach as tau; a rising function, so bounds may be compared before or after.
-    tau_low = np.arctan2(s * np.sin(low), np.cos(low))
-    tau_high = np.arctan2(s * np.sin(high), np.cos(high))
+    sin_t, cos_t = k * towards[:, 0] / squeezed, towards[:, 1] / squeezed
+    # Sine and cosine of the ends of the reach. On the side away from the direction the dome itself ends it.
+    sin_low, cos_low, sin_high, cos_high = -cos_t, np.maximum(0.0, sin_t), cos_t.copy(), np.maximum(0.0, -sin_t)
+    window = np.empty((len(pairs), 4))
+    for p in range(len(pairs)):
+        window[p] = math.sin(windows[p, 0]), math.cos(windows[p, 0]), math.sin(windows[p, 1]), math.cos(windows[p, 1])
     out = np.zeros((len(pairs), 2))
     widest = np.max(windows[:, 2]) if len(pairs) else 0.0
     for q in range(begin, end):
@@ -198,27 +224,32 @@ def dome_terms(
         further = azimuth + math.pi / 3
         lattice = (2 * math.cos(azimuth), 2 * math.sin(azimuth), 2 * math.cos(further), 2 * math.sin(further))
         weight = (2 if q else 1) * rho * math.pi / slices / CELL_AREA
-        for d in range(len(t)):
+        for d in range(len(sin_t)):
             # The lattice is symmetric about the dome's centre: a direction from -x is one from +x with the slice on the other side.
-            if t[d] >= 0:
-                high[d] = t[d] + reach(t[d], y, lattice, neighbours)
-                if lobe:
-                    tau_high[d] = math.atan2(s * math.sin(high[d]), math.cos(high[d]))
+            side = 1.0 if sin_t[d] >= 0 else -1.0
+            edge = reach(side * sin_t[d], cos_t[d], side * y, lattice, neighbours)
+            beside = math.sqrt(1 - edge * edge)
+            sin = edge * cos_t[d] + beside * side * sin_t[d]
+            cos = max(0.0, beside * cos_t[d] - edge * side * sin_t[d])
+            if side > 0:
+                sin_high[d], cos_high[d] = sin, cos
             else:
-                low[d] = t[d] - reach(-t[d], -y, lattice, neighbours)
-                if lobe:
-                    tau_low[d] = math.atan2(s * math.sin(low[d]), math.cos(low[d]))
+                sin_low[d], cos_low[d] = -sin, cos
         for p in range(len(pairs)):
             i, r = pairs[p]
-            first, last = max(low[i], low[r]), min(high[i], high[r])
-            if first >= last:
+            first, last = (i if sin_low[i] > sin_low[r] else r), (i if sin_high[i] < sin_high[r] else r)
+            sin_1, cos_1, sin_2, cos_2 = sin_low[first], cos_low[first], sin_high[last], cos_high[last]
+            if sin_1 >= sin_2:
                 continue
             if diffuse:
                 # N.L dA on the dome is k |L'| rho cos(psi - t) dpsi dy on the unit sphere, L' = (Lx, Lz / k).
-                out[p, 0] += weight * rho * squeezed[i] * (math.sin(last - t[i]) - math.sin(first - t[i]))
+                out[p, 0] += weight * rho * squeezed[i] * ((sin_2 - sin_1) * cos_t[i] - (cos_2 - cos_1) * sin_t[i])
             if lobe and eta <= windows[p, 2]:
-                first = max(windows[p, 0], tau_low[i], tau_low[r])
-                last = min(windows[p, 1], tau_high[i], tau_high[r])
-                if first < last:
-                    out[p, 1] += weight * lobe_on_slice(first, last, y, k, towards[i], towards[r], exponent, nodes, weights)
+                if window[p, 0] > sin_1:
+                    sin_1, cos_1 = window[p, 0], window[p, 1]
+                if window[p, 2] < sin_2:
+                    sin_2, cos_2 = window[p, 2], window[p, 3]
+                if sin_1 < sin_2:
+                    light, view = towards[i], towards[r]
+                    out[p, 1] += weight * lobe_on_slice(sin_1, cos_1, sin_2, cos_2, y, k, light, view, exponent, nodes, weights)
     return out

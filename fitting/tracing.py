@@ -1,4 +1,4 @@
-"""Rays through one face of a petal: smooth dielectric domes in hexagonal packing over a slab of the same stuff (numba kernels).
+"""Rays among domes in hexagonal packing (numba kernels): through dielectric ones for body light, between opaque ones for interreflection.
 
 A dome is the convex body (z / h)^q + r^p <= 1, z >= 0. It lies inside its own hexagon of the packing, so a ray outside goes from hexagon to
 hexagon and meets one dome at a time. Along a ray the body's function is convex too: Newton from outside runs up to the wall and never past
@@ -8,17 +8,29 @@ At every wall the ray splits by Fresnel's equations for unpolarised light; small
 dropped: it reaches the tissue below, leaves into the air, or is counted as lost after EVENTS walls.
 
 Paths are kept as four moments a bin: what `body.gauss` makes two nodes of.
+
+Kernels of both `fitting.body` and `fitting.orders` are in this one file because numba's cache looks at the file of the cached function
+only: a kernel that calls `march` from elsewhere would go on with the `march` it was compiled with. They are serial and let go of the
+interpreter's lock; `on_all_cores` spreads them over threads. Whatever is drawn by lot or summed belongs to one call, so results are the
+same however many threads there are.
 """
 
 from __future__ import annotations
 
 import math
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from fitting.cells import Cell
+
 Array = NDArray[np.float64]
+Result = TypeVar("Result")
 
 ESCAPED, DOME, FLOOR, LOST = 0, 1, 2, 3
 EVENTS = 1000
@@ -28,6 +40,82 @@ HEXAGONS = 100_000
 SPLIT = 0.004
 """Shares of light smaller than this are drawn by lot."""
 STACK = 256
+
+
+class Domes(NamedTuple):
+    """Domes z = h (1 - r^p)^(1/q) and the distance of neighbours, in base radii; h = 0 is a flat face."""
+
+    h: float
+    p: float
+    q: float
+    pitch: float
+
+    @classmethod
+    def of(cls, cell: Cell | None) -> Domes:
+        """Take a cell's numbers; None is a flat face."""
+        if cell is None:
+            return cls(0.0, 2.0, 2.0, 2.0)
+        return cls(float(cell.stretch), float(cell.p), float(cell.q), float(cell.pitch))
+
+
+class Layer(NamedTuple):
+    """What body light goes through.
+
+    Attributes
+    ----------
+    domes : Domes
+        On top.
+    depth : float
+        Of the slab below them, base radii.
+    n : float
+        Refractive index of both.
+    edges : ndarray, shape (b,)
+        Lower bounds of the bins of path, the first 0, geometric from the second on.
+    """
+
+    domes: Domes
+    depth: float
+    n: float
+    edges: Array
+
+
+class Tally(NamedTuple):
+    """Where light went; kernels add to it.
+
+    Attributes
+    ----------
+    reached : ndarray, shape (j, b, 4)
+        Light at the tissue by its stream, even in the square of the sine of its angle, and by its path: moments 0 to 3 in each bin.
+    escaped : ndarray, shape (b, 4)
+        Light in the air, but for `shares`.
+    shares : ndarray, shape (3,)
+        Light turned away by one dome, by the floor, and lost.
+    stray : ndarray, shape (i, r, p)
+        `escaped` by the directions of light and view, `spread`. Of size 0 where nobody asks.
+    """
+
+    reached: Array
+    escaped: Array
+    shares: Array
+    stray: Array
+
+    @classmethod
+    def empty(cls, rows: int, streams: int, bins: int, nodes: tuple[int, int, int] = (0, 0, 0)) -> Tally:
+        """Make tallies of several rows at once, a leading axis each."""
+        shapes = (streams, bins, 4), (bins, 4), (3,), nodes
+        return cls(*(np.zeros((rows, *shape)) for shape in shapes))
+
+    def row(self, k: int) -> Tally:
+        """One of them."""
+        return Tally(*(part[k] for part in self))
+
+
+def on_all_cores(task: Callable[[int], Result], count: int) -> list[Result]:
+    """Results of task(0) to task(count - 1), in this order."""
+    if count == 1:
+        return [task(0)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(task, range(count)))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -41,8 +129,9 @@ def power(x: float, e: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def wall(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: float, p: float, q: float) -> tuple[float, float]:
+def wall(x: float, y: float, z: float, dx: float, dy: float, dz: float, domes: Domes) -> tuple[float, float]:
     """(z / h)^q + r^p - 1 at a point and its slope along a direction."""
+    h, p, q, _ = domes
     r = math.sqrt(x * x + y * y)
     s = max(0.0, z) / h
     slope = q * power(s, q - 1) * dz / h
@@ -52,11 +141,11 @@ def wall(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: float
 
 
 @njit(cache=True, nogil=True)
-def enter(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: float, p: float, q: float, end: float) -> float:
+def enter(x: float, y: float, z: float, dx: float, dy: float, dz: float, domes: Domes, end: float) -> float:
     """Way to the dome at the origin from a point outside it, -1 where there is none shorter than `end`."""
     t = 0.0
     for _ in range(100):
-        g, slope = wall(x + t * dx, y + t * dy, z + t * dz, dx, dy, dz, h, p, q)
+        g, slope = wall(x + t * dx, y + t * dy, z + t * dz, dx, dy, dz, domes)
         if g <= 0 and slope < 0:
             return t
         if slope >= 0:
@@ -71,7 +160,7 @@ def enter(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: floa
 
 
 @njit(cache=True, nogil=True)
-def leave(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: float, p: float, q: float) -> tuple[float, bool]:
+def leave(x: float, y: float, z: float, dx: float, dy: float, dz: float, domes: Domes) -> tuple[float, bool]:
     """Way out of the dome at the origin, and whether it leads through the base."""
     flat = dx * dx + dy * dy
     t = math.inf
@@ -81,9 +170,9 @@ def leave(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: floa
     if dz < 0 and -z / dz <= t:
         return max(0.0, -z / dz), True
     if dz > 0:
-        t = min(t, (h - z) / dz)
+        t = min(t, (domes.h - z) / dz)
     for _ in range(100):
-        g, slope = wall(x + t * dx, y + t * dy, z + t * dz, dx, dy, dz, h, p, q)
+        g, slope = wall(x + t * dx, y + t * dy, z + t * dz, dx, dy, dz, domes)
         if g <= 0 or slope <= 0:
             break
         step = g / slope
@@ -94,10 +183,9 @@ def leave(x: float, y: float, z: float, dx: float, dy: float, dz: float, h: floa
 
 
 @njit(cache=True, nogil=True)
-def march(
-    x: float, y: float, z: float, dx: float, dy: float, dz: float, h: float, p: float, q: float, pitch: float, from_dome: bool
-) -> tuple[int, float, float, float]:
+def march(x: float, y: float, z: float, dx: float, dy: float, dz: float, domes: Domes, from_dome: bool) -> tuple[int, float, float, float]:
     """Follow a ray outside the domes, 0 <= z <= h: what it meets, and where as seen from that hexagon's centre."""
+    h, pitch = domes.h, domes.pitch
     half, root = pitch / 2, math.sqrt(3) / 2
     skip = from_dome or h == 0
     for _ in range(HEXAGONS):
@@ -114,7 +202,7 @@ def march(
                     edge, ex, ey = t, sign * ax, sign * ay
         end = max(0.0, min(edge, floor, top))
         if not skip:
-            t = enter(x, y, z, dx, dy, dz, h, p, q, end)
+            t = enter(x, y, z, dx, dy, dz, domes, end)
             if t >= 0:
                 return DOME, x + t * dx, y + t * dy, max(0.0, z + t * dz)
         skip = h == 0
@@ -128,8 +216,9 @@ def march(
 
 
 @njit(cache=True, nogil=True)
-def normal(x: float, y: float, z: float, h: float, p: float, q: float) -> tuple[float, float, float]:
+def normal(x: float, y: float, z: float, domes: Domes) -> tuple[float, float, float]:
     """Outward normal of a dome at a point of its wall."""
+    h, p, q, _ = domes
     r = math.sqrt(x * x + y * y)
     along = p * power(r, p - 1)
     up = q * power(max(0.0, z) / h, q - 1) / h
@@ -197,19 +286,10 @@ def follow(
     dz: float,
     weight: float,
     path: float,
-    within: int,
+    within: bool,
     first: int,
-    h: float,
-    p: float,
-    q: float,
-    pitch: float,
-    depth: float,
-    n: float,
-    edges: Array,
-    reached: Array,
-    escaped: Array,
-    shares: Array,
-    stray: Array,
+    layer: Layer,
+    tally: Tally,
 ) -> None:
     """Follow a ray and all that it splits into.
 
@@ -219,46 +299,40 @@ def follow(
         Start, as seen from its hexagon's centre, and direction of flight; lengths in base radii.
     weight, path : float
         Its light, and the way it has already gone in the pigmented medium.
-    within : int
-        1 where it starts inside the dome, 0 outside.
+    within : bool
+        Whether it starts inside the dome.
     first : int
         What it has met: 0 nothing, 1 one dome that turned it away, 2 the floor alike, 3 anything else.
-    h, p, q, pitch, depth, n : float
-        Of the domes, the slab below them, and the refractive index.
-    edges : ndarray, shape (b,)
-        Lower bounds of the bins of path, the first 0, geometric from the second on.
-    reached : ndarray, shape (j, b, 4)
-        Added to: light at the tissue by the square of the sine of its angle.
-    escaped : ndarray, shape (b, 4)
-        Added to: light in the air, but for `shares`.
-    shares : ndarray, shape (3,)
-        Added to: light turned away by one dome, by the floor, and lost.
-    stray : ndarray, shape (i, r, p)
-        Added to: `escaped` by the directions of light and view, `spread`. Of size 0 for rays from below.
+    layer : Layer
+        What it goes through.
+    tally : Tally
+        Added to.
     """
+    domes, depth, n, edges = layer
+    reached, escaped, shares, stray = tally
     streams = reached.shape[0]
     ix, iy, theta_i = dx, dy, math.acos(min(1.0, abs(dz)))
     stack = np.empty((STACK, 8))
-    tags = np.empty((STACK, 2), np.int64)  # within, first
+    inside, met = np.empty(STACK, np.bool_), np.empty(STACK, np.int64)
     push(stack[0], x, y, z, dx, dy, dz, weight, path)
-    tags[0, 0], tags[0, 1] = within, first
+    inside[0], met[0] = within, first
     size = 1
     on_dome = False
     while size:
         size -= 1
         x, y, z, dx, dy, dz, weight, path = stack[size]
-        within, first = tags[size]
+        within, first = inside[size], met[size]
         for event in range(EVENTS + 1):
             if event == EVENTS:
                 shares[2] += weight
                 break
             if within:
-                t, base = leave(x, y, z, dx, dy, dz, h, p, q)
+                t, base = leave(x, y, z, dx, dy, dz, domes)
                 x, y, z = x + t * dx, y + t * dy, z + t * dz
                 path += t
                 what = FLOOR if base else DOME
             else:
-                what, x, y, z = march(x, y, z, dx, dy, dz, h, p, q, pitch, on_dome)
+                what, x, y, z = march(x, y, z, dx, dy, dz, domes, on_dome)
             if what == LOST:
                 shares[2] += weight
                 break
@@ -275,7 +349,7 @@ def follow(
                 j = min(streams - 1, int(streams * (dx * dx + dy * dy)))
                 deposit(reached[j], weight, path + depth / max(-dz, 1e-9), edges)
                 break
-            nx, ny, nz = (0.0, 0.0, 1.0) if what == FLOOR else normal(x, y, z, h, p, q)
+            nx, ny, nz = (0.0, 0.0, 1.0) if what == FLOOR else normal(x, y, z, domes)
             ratio = n
             if within:
                 nx, ny, nz, ratio = -nx, -ny, -nz, 1 / n
@@ -300,15 +374,15 @@ def follow(
                 else:
                     rx, ry, rz = tx, ty, tz
                 push(stack[size], x, y, z, rx, ry, rz, weight * part, path)
-                tags[size, 0] = within if refract else 1 - within
-                tags[size, 1] = (1 if first == 0 else 3) if refract else 3
+                inside[size] = within == refract
+                met[size] = 1 if refract and first == 0 else 3
                 size += 1
                 weight *= 1 - part
             else:
                 refract = np.random.random() >= share  # noqa: NPY002 - numba's own generator, seeded by the caller
             if refract:
                 dx, dy, dz = tx, ty, tz
-                within, first = 1 - within, 3
+                within, first = not within, 3
             else:
                 dx, dy, dz = dx + 2 * cos_i * nx, dy + 2 * cos_i * ny, dz + 2 * cos_i * nz
                 first = (1 if what == DOME else 2) if first == 0 else 3
@@ -331,110 +405,63 @@ def into_hexagon(u: float, v: float, pitch: float) -> tuple[float, float]:
     return bx, by
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def trace_down(
-    theta: Array,
-    points: Array,
-    shifts: Array,
-    seed: int,
-    h: float,
-    p: float,
-    q: float,
-    pitch: float,
-    depth: float,
-    n: float,
-    edges: Array,
-    streams: int,
-    nodes: tuple[int, int],
-) -> tuple[Array, Array, Array, Array]:
+@njit(cache=True, nogil=True)
+def start(point: Array, shift: Array, pitch: float) -> tuple[float, float, float, float]:
+    """Place in the hexagon, and cosine and sine of an azimuth within 60 deg, from three numbers 0 .. 1, moved around by `shift`."""
+    x, y = into_hexagon((point[0] + shift[0]) % 1, (point[1] + shift[1]) % 1, pitch)
+    azimuth = (point[2] + shift[2]) % 1 * math.pi / 3
+    return x, y, math.cos(azimuth), math.sin(azimuth)
+
+
+@njit(cache=True, nogil=True)
+def trace_down(theta: Array, points: Array, shift: Array, seed: int, layer: Layer, tally: Tally) -> None:
     """Light from the air.
 
     Parameters
     ----------
-    theta : ndarray, shape (k, m), rad
-        Incidence of each ray of each row.
-    points, shifts : ndarray, shape (m, 3) and (k, 3)
-        Place in the cell and azimuth, 0 .. 1, and by how much they are moved in each row.
+    theta : ndarray, shape (m,), rad
+        Incidence of each ray.
+    points, shift : ndarray, shape (m, 4) and (4,)
+        Place in the cell and azimuth, as `start` takes them; the fourth is not used here.
     seed : int
         Of the shares drawn by lot.
-    h, p, q, pitch, depth, n, edges
+    layer, tally
         As in `follow`.
-    streams : int
-        Directions at the tissue, even in the square of the sine.
-    nodes : tuple of int
-        Of the angle in air and of the azimuth in `stray`.
-
-    Returns
-    -------
-    ndarray, shape (k, j, b, 4); ndarray, shape (k, b, 4); ndarray, shape (k, 3); ndarray, shape (k, i, r, p)
-        `reached`, `escaped`, `shares` and `stray` of `follow`, summed over the rays.
     """
-    rows, rays = theta.shape
-    stray = np.zeros((rows, nodes[0], nodes[0], nodes[1]))
-    reached = np.zeros((rows, streams, len(edges), 4))
-    escaped = np.zeros((rows, len(edges), 4))
-    shares = np.zeros((rows, 3))
-    for k in prange(rows):
-        np.random.seed(seed + k)  # noqa: NPY002
-        for m in range(rays):
-            x, y = into_hexagon((points[m, 0] + shifts[k, 0]) % 1, (points[m, 1] + shifts[k, 1]) % 1, pitch)
-            azimuth = (points[m, 2] + shifts[k, 2]) % 1 * math.pi / 3
-            sin, cos = math.sin(theta[k, m]), math.cos(theta[k, m])
-            dx, dy = -sin * math.cos(azimuth), -sin * math.sin(azimuth)
-            follow(x, y, h, dx, dy, -cos, 1.0, 0.0, 0, 0, h, p, q, pitch, depth, n, edges, reached[k], escaped[k], shares[k], stray[k])
-    return reached, escaped, shares, stray
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def trace_up(
-    points: Array,
-    shifts: Array,
-    seed: int,
-    h: float,
-    p: float,
-    q: float,
-    pitch: float,
-    depth: float,
-    n: float,
-    edges: Array,
-    streams: int,
-) -> tuple[Array, Array, Array]:
-    """Light from the tissue, each row one stream of directions, `points` and `shifts` with a fourth column for the place in the stream.
-
-    The rest as for `trace_down`; all light in the air is `escaped`.
-    """
-    reached = np.zeros((streams, streams, len(edges), 4))
-    escaped = np.zeros((streams, len(edges), 4))
-    shares = np.zeros((streams, 3))
-    none = np.zeros((0, 0, 0))
-    for k in prange(streams):
-        np.random.seed(seed + k)  # noqa: NPY002
-        for m in range(len(points)):
-            x, y = into_hexagon((points[m, 0] + shifts[k, 0]) % 1, (points[m, 1] + shifts[k, 1]) % 1, pitch)
-            azimuth = (points[m, 2] + shifts[k, 2]) % 1 * math.pi / 3
-            sin2 = (k + (points[m, 3] + shifts[k, 3]) % 1) / streams
-            sin, cos = math.sqrt(sin2), max(1e-9, math.sqrt(1 - sin2))
-            dx, dy = sin * math.cos(azimuth), sin * math.sin(azimuth)
-            path = depth / cos
-            if h > 0 and x * x + y * y < 1:
-                follow(x, y, 0.0, dx, dy, cos, 1.0, path, 1, 3, h, p, q, pitch, depth, n, edges, reached[k], escaped[k], shares[k], none)
-                continue
-            # The floor of a gap, from below.
-            share, cos_t = fresnel(cos, 1 / n)
-            deposit(reached[k, k], share, 2 * path, edges)
-            if share < 1:
-                dx, dy = n * dx, n * dy
-                part = 1 - share
-                follow(x, y, 0.0, dx, dy, cos_t, part, path, 0, 3, h, p, q, pitch, depth, n, edges, reached[k], escaped[k], shares[k], none)
-    return reached, escaped, shares
+    np.random.seed(seed)  # noqa: NPY002
+    for m in range(len(theta)):
+        x, y, ca, sa = start(points[m], shift, layer.domes.pitch)
+        sin, cos = math.sin(theta[m]), math.cos(theta[m])
+        follow(x, y, layer.domes.h, -sin * ca, -sin * sa, -cos, 1.0, 0.0, False, 0, layer, tally)
 
 
 @njit(cache=True, nogil=True)
-def mirror_density(tilt: float, h: float, p: float, q: float) -> tuple[float, float, float]:
+def trace_up(stream: int, points: Array, shift: Array, seed: int, layer: Layer, tally: Tally) -> None:
+    """Light from the tissue in one of its streams, the fourth number of a point being the place in it; the rest as for `trace_down`."""
+    np.random.seed(seed)  # noqa: NPY002
+    h, n = layer.domes.h, layer.n
+    for m in range(len(points)):
+        x, y, ca, sa = start(points[m], shift, layer.domes.pitch)
+        sin2 = (stream + (points[m, 3] + shift[3]) % 1) / len(tally.reached)
+        sin, cos = math.sqrt(sin2), max(1e-9, math.sqrt(1 - sin2))
+        path = layer.depth / cos
+        if h > 0 and x * x + y * y < 1:
+            follow(x, y, 0.0, sin * ca, sin * sa, cos, 1.0, path, True, 3, layer, tally)
+            continue
+        # The floor of a gap, from below.
+        share, cos_t = fresnel(cos, 1 / n)
+        deposit(tally.reached[stream], share, 2 * path, layer.edges)
+        if share < 1:
+            follow(x, y, 0.0, n * sin * ca, n * sin * sa, cos_t, 1 - share, path, False, 3, layer, tally)
+
+
+@njit(cache=True, nogil=True)
+def mirror_density(tilt: float, domes: Domes) -> tuple[float, float, float]:
     """Where a dome's normal has a tilt: r, z, and the dome's area per solid angle of its normals (1 / Gaussian curvature); 0 if nowhere.
 
     The slope s = h p / q r^(p-1) (1 - r^p)^(1/q-1) of a convex profile grows with r: bisection in r, or in 1 - r^p near the rim.
     """
+    h, p, q, _ = domes
     tan = math.tan(tilt)
     if tan < 1e-9:
         return 0.0, h, (0.0 if p < 2 else (math.inf if p > 2 else (q / (2 * h)) ** 2))
@@ -463,8 +490,8 @@ def mirror_density(tilt: float, h: float, p: float, q: float) -> tuple[float, fl
     return r, h * rest ** (1 / q), 1 / (s_over_r * growth * cos2 * cos2)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def mirror(wi: Array, wo: Array, h: float, p: float, q: float, pitch: float, n: float, turns: int) -> Array:
+@njit(cache=True, nogil=True)
+def mirror(wi: Array, wo: Array, domes: Domes, n: float, turns: int) -> Array:
     """Light turned once by the domes' walls, in 1/sr, averaged over `turns` azimuths of the lattice.
 
     F D G / (4 cos cos), with the normals' density D of the dome itself and G the exact share of azimuths in which light and view both clear
@@ -474,8 +501,8 @@ def mirror(wi: Array, wo: Array, h: float, p: float, q: float, pitch: float, n: 
     ----------
     wi, wo : ndarray, shape (m, 3)
         Unit vectors away from the surface, above its horizon.
-    h, p, q, pitch, n : float
-        As in `follow`.
+    domes, n : Domes, float
+        As in `Layer`.
     turns : int
         As above.
 
@@ -483,14 +510,14 @@ def mirror(wi: Array, wo: Array, h: float, p: float, q: float, pitch: float, n: 
     -------
     ndarray, shape (m,)
     """
-    area = pitch * pitch * math.sqrt(3) / 2
+    area = domes.pitch * domes.pitch * math.sqrt(3) / 2
     out = np.zeros(len(wi))
-    for m in prange(len(wi)):
+    for m in range(len(wi)):
         hx, hy, hz = wi[m, 0] + wo[m, 0], wi[m, 1] + wo[m, 1], wi[m, 2] + wo[m, 2]
         length = math.sqrt(hx * hx + hy * hy + hz * hz)
         hx, hy, hz = hx / length, hy / length, hz / length
         flat = math.hypot(hx, hy)
-        r, z, density = mirror_density(math.atan2(flat, hz), h, p, q)
+        r, z, density = mirror_density(math.atan2(flat, hz), domes)
         if density == 0.0:
             continue
         share, _ = fresnel(min(1.0, wi[m, 0] * hx + wi[m, 1] * hy + wi[m, 2] * hz), n)
@@ -503,11 +530,104 @@ def mirror(wi: Array, wo: Array, h: float, p: float, q: float, pitch: float, n: 
             free = True
             for w in (wi[m], wo[m]):
                 dx, dy = w[0] * cos - w[1] * sin, w[0] * sin + w[1] * cos
-                what, _x, _y, _z = march(x, y, z, dx, dy, w[2], h, p, q, pitch, True)
+                what, _x, _y, _z = march(x, y, z, dx, dy, w[2], domes, True)
                 if what != ESCAPED:
                     free = False
                     break
             if free:
                 clear += 1
         out[m] = share * density / area * clear / turns / (4 * wi[m, 2] * wo[m, 2])
+    return out
+
+
+@njit(cache=True, nogil=True)
+def gap_azimuth(share: float, pitch: float) -> float:
+    """Azimuth, 0 to 60 deg, below which lies that share of the floor between rim and hexagon."""
+    far2 = pitch * pitch / 4
+    # The floor up to an azimuth off a neighbour's is far2 tan(off) - off, doubled; Newton from the end, where it is steepest.
+    within = min(share, 1 - share) * 2 * (far2 * math.tan(math.pi / 6) - math.pi / 6)
+    off = math.pi / 6
+    for _ in range(60):
+        tan = math.tan(off)
+        slope = far2 * (1 + tan * tan) - 1
+        step = (far2 * tan - off - within) / slope if slope > 0 else 0.0
+        off -= step
+        if abs(step) < 1e-12:
+            break
+    return off if share < 0.5 else math.pi / 3 - off
+
+
+@njit(cache=True, nogil=True)
+def cast(edges: Array, sectors: int, facet: int, move: float, sobol: Array, domes: Domes) -> NDArray[np.int64]:
+    """Count where Lambert rays from one facet arrive.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (rings + 1,), rad
+        Bounds of the rings of facets in tau, r = sin(tau)^(2/p), rim last.
+    sectors : int
+        Facets in a ring. Facets are numbered ring by ring from the tip; then come the six sixths of the floor.
+    facet : int
+        From which.
+    move : float
+        By how much the rays' numbers are moved around, 0 .. 1 (Cranley and Patterson): were they the same for all facets, errors would add.
+    sobol : ndarray, shape (m, 4)
+        Place on the facet and direction of each ray, 0 .. 1.
+    domes : Domes
+        The shape.
+
+    Returns
+    -------
+    ndarray of int, shape (facets + 2,)
+        The last two are the sky and rays that did not end.
+    """
+    h, p, q, pitch = domes
+    rings = len(edges) - 1
+    row, sector = facet // sectors, facet % sectors
+    count = rings * sectors + 6
+    out = np.zeros(count + 2, np.int64)
+    for n in range(len(sobol)):
+        aside = (sobol[n, 1] + move) % 1
+        azimuth = 2 * math.pi * (sector + aside) / sectors if row < rings else gap_azimuth(aside, pitch) + sector * math.pi / 3
+        ca, sa = math.cos(azimuth), math.sin(azimuth)
+        if row < rings:
+            tau = edges[row] + (edges[row + 1] - edges[row]) * ((sobol[n, 0] + move) % 1)
+            r, z = math.sin(tau) ** (2 / p), h * math.cos(tau) ** (2 / q)
+            up, along = q * (max(z, 0.0) / h) ** (q - 1) / h, p * r ** (p - 1)
+            length = math.hypot(up, along)
+            up, along = up / length, along / length
+        else:
+            # The floor reaches from the rim to the hexagon's edge, wherever that is at this azimuth.
+            off = (azimuth + math.pi / 6) % (math.pi / 3) - math.pi / 6
+            far = pitch / 2 / math.cos(off)
+            r, z = math.sqrt(1 + (far * far - 1) * ((sobol[n, 0] + move) % 1)), 0.0
+            up, along = 1.0, 0.0
+        sin2 = (sobol[n, 2] + move) % 1
+        sin, cos, turn = math.sqrt(sin2), math.sqrt(1 - sin2), 2 * math.pi * ((sobol[n, 3] + move) % 1)
+        s, t = sin * math.cos(turn), sin * math.sin(turn)
+        # About the normal (along, 0, up) in the plane of azimuth: downhill (up, 0, -along), and sideways.
+        radial, dz = cos * along + s * up, cos * up - s * along
+        dx, dy = radial * ca - t * sa, radial * sa + t * ca
+        if dz >= 0 and z >= h:
+            what, x, y, height = ESCAPED, 0.0, 0.0, 0.0
+        else:
+            what, x, y, height = march(r * ca, r * sa, z, dx, dy, dz, domes, row < rings)
+        if what == ESCAPED:
+            out[count] += 1
+            continue
+        if what == LOST:
+            out[count + 1] += 1
+            continue
+        where = math.atan2(y, x) / (2 * math.pi) % 1
+        if what == DOME:
+            # From whichever coordinate is the better known there.
+            flat = min(1.0, math.hypot(x, y)) ** (p / 2)
+            steep = min(1.0, max(0.0, height / h)) ** (q / 2)
+            angle = math.atan2(flat, steep)
+            hit = 0
+            while hit < rings - 1 and angle > edges[hit + 1]:
+                hit += 1
+            out[hit * sectors + min(sectors - 1, int(where * sectors))] += 1
+        else:
+            out[rings * sectors + min(5, int(where * 6))] += 1
     return out

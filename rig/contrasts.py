@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from render.camera import Camera
     from render.raycast import Picture, Raycaster
     from rig.fits import StoredFit
-    from rig.pictures import Shades
+    from rig.workspace import Workspace
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ContrastRow:
 
 
 def compare(
-    raycaster: "Raycaster", camera: "Camera", fits: "Mapping[str, StoredFit]", shades: "Shades"
+    raycaster: "Raycaster", camera: "Camera", fits: "Mapping[str, StoredFit]", workspace: "Workspace"
 ) -> "tuple[dict[str, Picture], list[ContrastRow], float]":
     """Take the picture with each fit and measure its contrast; return the pictures, the rows, and C of a Lambert surface.
 
@@ -51,13 +51,13 @@ def compare(
         If too little of the flower faces the light, or mirrors it, to compare.
     """
     from render import Lambert, measure_contrast
-    from rig.pictures import take
+    from rig.pictures import shade_of, take
 
     pictures, rows = {}, []
     for label, fit in fits.items():
         tall = refitted(fit, ROSE_ASPECT)
-        pictures[label] = take(raycaster, camera, shades.of(fit))
-        C, C_tall = (measure_contrast(picture).C for picture in (pictures[label], take(raycaster, camera, shades.of(tall))))
+        pictures[label], tall_picture = (take(raycaster, camera, shade_of(some, workspace)) for some in (fit, tall))
+        C, C_tall = (measure_contrast(picture).C for picture in (pictures[label], tall_picture))
         rows.append(
             ContrastRow(label, _ratio(fit, fit.fit.measured), _ratio(fit, fit.fit.modelled), C, _ratio(tall, tall.fit.modelled), C_tall)
         )

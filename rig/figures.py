@@ -93,26 +93,42 @@ def saved_figure(size: tuple[float, float], paths: Sequence[Path], marks: Sequen
 
 
 def _polar_axes(figure: "Figure", scale: float, theta_i: float, unit: str) -> Any:
-    """Return a half disc, the normal upwards, the light's side to the right, with L drawn in."""
-    # The half disc is as wide as its square box and stands in its middle: the box reaches beyond the figure.
-    width, height = figure.get_size_inches()
-    side, bottom = width - 1.2, 0.7
-    rect = ((width - side) / 2 / width, (bottom - side / 4) / height, side / width, side / height)
-    axes: Any = figure.add_axes(rect, projection="polar")
-    axes.set_theta_zero_location("N")
-    axes.set_theta_direction(-1)
-    axes.set_thetalim(-math.pi / 2, math.pi / 2)
-    axes.set_rlim(0, scale)
-    axes.set_rticks([scale * i / 4 for i in range(1, 5)])
-    axes.set_thetagrids(range(-90, 91, 30))
-    axes.grid(color="0.85", linewidth=0.6)
-    light = math.radians(theta_i)
-    arrow = {"arrowstyle": "-|>", "color": "0.35", "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
-    axes.annotate("", xy=(light, scale), xytext=(0, 0), arrowprops=arrow)  # L points towards the light
-    axes.text(light, scale * 1.06, "L", fontweight="bold", color="0.25", ha="center", va="center")
+    """Return a half disc that fills the figure, the normal upwards, the light's side to the right, with L drawn in."""
+    axes = polar_axes(figure, 0.6, 0.7, figure.get_size_inches()[0] - 1.2, scale)
+    towards_light(axes, theta_i)
     caption = f"reflected light by angle $\\theta_r$, scale {scale:g}{f' {unit}' if unit else ''}"
     figure.text(0.5, 0.02, caption, ha="center", va="bottom")
     return axes
+
+
+def polar_axes(figure: "Figure", left: float, bottom: float, side: float, scale: float, *, whole: bool = False) -> Any:
+    """Return a half disc `side` inches wide, or a whole one, the normal upwards and the light's side to the right."""
+    # A half disc is as wide as its square box and stands in its middle: the box reaches beyond it.
+    width, height = figure.get_size_inches()
+    box = bottom if whole else bottom - side / 4
+    axes: Any = figure.add_axes((left / width, box / height, side / width, side / height), projection="polar")
+    axes.set_theta_zero_location("N")
+    axes.set_theta_direction(-1)
+    if whole:
+        axes.set_thetalim(-math.pi, math.pi)
+        axes.set_rlabel_position(105)
+    else:
+        axes.set_thetalim(-math.pi / 2, math.pi / 2)
+    axes.set_rlim(0, scale)
+    axes.set_rticks([scale * i / 4 for i in range(1, 5)])
+    axes.set_thetagrids(range(-150, 181, 30) if whole else range(-90, 91, 30))
+    axes.grid(color="0.85", linewidth=0.6)
+    return axes
+
+
+def towards_light(axes: Any, theta_i: float) -> None:
+    """Draw L, which points towards the light, into polar axes."""
+    light, scale = math.radians(theta_i), axes.get_rmax()
+    arrow = {"arrowstyle": "-|>", "color": "0.35", "lw": 1.4, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=(light, scale), xytext=(0, 0), arrowprops=arrow)
+    # Where the rim has a number, the letter stands beside the arrow.
+    place = (light + 0.08, scale * 0.93) if abs(theta_i % 30 - 15) > 9 else (light, scale * 1.06)
+    axes.text(*place, "L", fontweight="bold", color="0.25", ha="center", va="center")
 
 
 def _scale(fits: Sequence["StoredFit"], wanted: float) -> float:

@@ -8,10 +8,11 @@ import numpy as np
 
 from rig.contrasts import compare, contrast_table
 from rig.figures import saved_figure
-from rig.pictures import Shades, frame, show, take
+from rig.pictures import frame, shade_of, show, take
 
 if TYPE_CHECKING:
     from rig.fits import StoredFit
+    from rig.workspace import Workspace
 
 SIDE = 640
 DETAIL = 0.28
@@ -19,7 +20,7 @@ DETAIL = 0.28
 
 
 def draw_flower(
-    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, marks: Sequence[str], shades: Shades | None = None
+    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, marks: Sequence[str], workspace: "Workspace"
 ) -> tuple[list[Path], str]:
     """Draw figures 11, 13 and 14 as PNG into `folder`; return the files and the table of contrasts.
 
@@ -32,8 +33,8 @@ def draw_flower(
         Made where it is not there.
     marks : sequence of str
         What every figure must say of itself; see `rig.pictures.marks_of`.
-    shades : Shades, optional
-        Reflectance tables that exist already.
+    workspace : Workspace
+        Keeps the reflection models.
     """
     from render.camera import Box
     from render.images import boxed
@@ -42,7 +43,7 @@ def draw_flower(
 
     folder.mkdir(parents=True, exist_ok=True)
     scene = read_flower(flower)
-    raycaster, shades = Raycaster(scene), shades or Shades({})
+    raycaster, shade = Raycaster(scene), shade_of(fits["RR"], workspace)
     camera = frame(raycaster, SIDE, SIDE)
     written = [folder / f"figure-{number}.png" for number in (11, 13, 14)]
 
@@ -50,15 +51,15 @@ def draw_flower(
         first = sorted(flower.glob("petals/*/mesh.ply"))[0]
         _polygons(figure, read_mesh(first), first.parent.name)
 
-    picture = take(raycaster, camera, shades.of(fits["RR"]))
+    picture = take(raycaster, camera, shade)
     whole = show(picture, "RR")
     side = round(SIDE * DETAIL)
     box = Box(*_brightest(picture.radiance, side), side, side)
-    detail = show(take(raycaster, camera.detail(box, enlarge=SIDE / side), shades.of(fits["RR"])), "RR")
+    detail = show(take(raycaster, camera.detail(box, enlarge=SIDE / side), shade), "RR")
     with saved_figure((9, 4.8), [written[1]], marks) as figure:
         _images(figure, {"RR": boxed(whole, box), f"detail, {SIDE / side:.1f} times": detail})
 
-    pictures, rows, matt = compare(raycaster, camera, fits, shades)
+    pictures, rows, matt = compare(raycaster, camera, fits, workspace)
     images = {f"{r.label}: C {r.C:.2f}, I(+40)/I(-40) {r.measured:.2f}": show(pictures[r.label], r.label) for r in rows}
     with saved_figure((9, 9.4), [written[2]], marks) as figure:
         _images(figure, images)

@@ -2,16 +2,17 @@
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rig.errors import RunError
 from rig.figures import SIMULATED
 from rig.fits import StoredFit, latest_fit, list_fits, read_fit
+from rig.models import stored_model
+from rig.workspace import Workspace
 
 if TYPE_CHECKING:
-    from fitting.table import Reflectance, ReflectanceTable
+    from fitting.reflectance import Reflectance
     from render.camera import Camera
     from render.light import Light
     from render.raycast import Picture, Raycaster, Shading
@@ -67,20 +68,12 @@ def marked(image: Any, marks: Sequence[str]) -> Any:
     return cv2.putText(image.copy(), ", ".join(marks), place, font, size, MARK, 2) if marks else image
 
 
-@dataclass
-class Shades:
-    """Reflectance tables, one for each cell shape, computed when first asked for."""
+def shade_of(fit: StoredFit, workspace: Workspace) -> "Reflectance":
+    """Return the intensity of eq. (8) for any direction, as `fit` has it; its model is kept in the workspace."""
+    from fitting.cells import Cell
 
-    tables: "dict[tuple[float, float, float], ReflectanceTable]"
-
-    def of(self, fit: StoredFit) -> "Reflectance":
-        """Return the intensity of eq. (8) for any direction, as `fit` has it."""
-        from fitting.table import tabulate
-
-        key = (fit.fit.aspect, fit.fit.n_us, fit.fit.n_ss)
-        if key not in self.tables:
-            self.tables[key] = tabulate(aspect=key[0], n_us=key[1], n_ss=key[2])
-        return self.tables[key].mixed(fit.fit.x)
+    model = stored_model(workspace, "paper", Cell(fit.fit.aspect), n_us=fit.fit.n_us, n_ss=fit.fit.n_ss)
+    return model.reflectance(**fit.fit.x)
 
 
 def frame(raycaster: "Raycaster", width: int, height: int, towards: tuple[float, float, float] = ABOVE) -> "Camera":

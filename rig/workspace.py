@@ -9,7 +9,7 @@ from rig.errors import RunError
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where things lie: `runs/`, `fits/`, `figures/`, `flowers/` and `cultivars.toml` under one root."""
+    """Where things lie: `runs/`, `fits/`, `figures/`, `flowers/`, `models/` and `cultivars.toml` under one root."""
 
     root: Path
 
@@ -37,6 +37,11 @@ class Workspace:
     def flowers(self) -> Path:
         """Folder of the flowers, one folder each."""
         return self.root / "flowers"
+
+    @property
+    def models(self) -> Path:
+        """Folder of the reflection models that were built, one .npz file each; they can be built again."""
+        return self.root / "models"
 
     @property
     def cultivars(self) -> Path:

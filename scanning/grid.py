@@ -62,6 +62,14 @@ def join(root: Indices, a: int, b: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def unlabelled(height: int, width: int) -> tuple[Indices, Indices]:
+    """Labels of a grid, all 0, and a forest with room for as many trees as the grid has places."""
+    root = np.empty(height * width + 1, np.int32)
+    root[0] = 0
+    return np.zeros((height, width), np.int32), root
+
+
+@njit(cache=True, nogil=True)
 def number_pieces(label: Indices, root: Indices, used: int) -> int:
     """Replace provisional labels by the pieces' numbers, 1 to the count, in the order of their first points."""
     number = np.zeros(used + 1, np.int32)
@@ -83,9 +91,7 @@ def number_pieces(label: Indices, root: Indices, used: int) -> int:
 def islands(depth: Array, jump: float) -> tuple[Indices, int]:
     """Label the pieces that hang together over the four neighbours: 0 where there is no point, else 1 to the count."""
     height, width = depth.shape
-    label = np.zeros((height, width), np.int32)
-    root = np.empty(height * width + 1, np.int32)
-    root[0] = 0
+    label, root = unlabelled(height, width)
     used = 0
     for i in range(height):
         for j in range(width):
@@ -804,9 +810,7 @@ def keep_largest_fan(square: NDArray[np.uint8], i: int, j: int) -> None:
 def largest_sheet(square: NDArray[np.uint8]) -> None:
     """Leave only the triangles that hang together with most others; every vertex has one fan, so common corners will do."""
     height, width = square.shape
-    label = np.zeros((height, width), np.int32)
-    root = np.empty(height * width + 1, np.int32)
-    root[0] = 0
+    label, root = unlabelled(height, width)
     used = 0
     for i in range(height):
         for j in range(width):

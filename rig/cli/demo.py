@@ -20,6 +20,7 @@ from rig.progress import steps
 from rig.runs import Run, new_run_path
 from rig.trajectory import Trajectory, parse_angles
 from rig.units import duration
+from rig.workspace import Workspace
 
 PETALS, OPENING, SEED = 25, 0.45, 3
 SIDE = 800
@@ -52,7 +53,7 @@ def command(settings: Settings, petals: int) -> int:
     click.echo("\n" + closing_table(fits, runs))
     flower = settings.workspace.flowers / "demo"
     free = build_rose(flower, petals)
-    picture = picture_rose(flower, fits, settings.workspace.figures)
+    picture = picture_rose(flower, fits, settings.workspace)
     click.echo(f"\nruns     {settings.workspace.runs}\nfits     {settings.workspace.fits}\nflower   {flower}")
     click.echo(f"figures  {settings.workspace.figures}\npicture  {picture}")
     click.echo(f"all done in {duration(time.monotonic() - started)}")
@@ -75,21 +76,21 @@ def build_rose(flower: Path, petals: int) -> bool:
     return assembly.state == "free"
 
 
-def picture_rose(flower: Path, fits: dict[str, StoredFit], folder: Path) -> Path:
+def picture_rose(flower: Path, fits: dict[str, StoredFit], workspace: Workspace) -> Path:
     """Draw the flower's figures and take its picture with the reflectance of Rote Rose; return the picture."""
     from render.images import write_exr, write_png
     from render.raycast import Raycaster
     from render.scene import read_flower
     from rig.flowerfigures import draw_flower
-    from rig.pictures import Shades, frame, marked, marks_of, show, take
+    from rig.pictures import frame, marked, marks_of, shade_of, show, take
 
-    shades, marks = Shades({}), marks_of(flower, *fits.values())
+    folder, marks = workspace.figures, marks_of(flower, *fits.values())
     with steps("ray-casting") as progress:
         progress(0, 2, "figures 11, 13, 14")
-        _, contrasts = draw_flower(flower, fits, folder, marks=marks, shades=shades)
+        _, contrasts = draw_flower(flower, fits, folder, marks=marks, workspace=workspace)
         progress(1, 2, "the rose")
         raycaster = Raycaster(read_flower(flower))
-        picture = take(raycaster, frame(raycaster, SIDE, SIDE), shades.of(fits["RR"]), samples=9)
+        picture = take(raycaster, frame(raycaster, SIDE, SIDE), shade_of(fits["RR"], workspace), samples=9)
     click.echo("\n" + contrasts)
     path = folder / "rose.png"
     write_png(marked(show(picture, "RR"), marks), path)

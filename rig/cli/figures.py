@@ -26,7 +26,7 @@ def command(settings: Settings, flower: Path | None, out: str | None) -> None:
     from rig.flowerfigures import draw_flower
     from rig.pictures import marks_of
 
-    written, contrasts = draw_flower(flower, fits, folder, marks=marks_of(flower, *fits.values()))
+    written, contrasts = draw_flower(flower, fits, folder, marks=marks_of(flower, *fits.values()), workspace=settings.workspace)
     for path in written:
         click.echo(path)
     click.echo(contrasts, err=True)

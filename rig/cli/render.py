@@ -6,7 +6,7 @@ import click
 
 from rig.cli.settings import Settings
 from rig.errors import ConfigError
-from rig.pictures import ABOVE, Shades, find_fit, frame, marked, marks_of, show, take
+from rig.pictures import ABOVE, find_fit, frame, marked, marks_of, shade_of, show, take
 
 
 @click.command(
@@ -51,7 +51,7 @@ def command(
     raycaster = Raycaster(read_flower(flower))
     camera = frame(raycaster, int(width), int(height), _triple(towards, "--from") if towards else ABOVE)
     lamp = NearLight(_triple(light_at, "--light-at")) if light_at else DistantLight(_triple(light, "--light")) if light else DistantLight()
-    picture = take(raycaster, camera, Shades({}).of(fit), light=lamp, samples=samples)
+    picture = take(raycaster, camera, shade_of(fit, settings.workspace), light=lamp, samples=samples)
     path = Path(out) if out else Path(flower) / f"{fit.label}.png"
     marks = marks_of(Path(flower), fit)
     write_png(marked(show(picture, fit.label), marks), path)

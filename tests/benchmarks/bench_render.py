@@ -10,7 +10,8 @@ import time
 
 import numpy as np
 
-from fitting.table import tabulate
+from fitting.cells import Cell
+from fitting.table import paper_table
 from render import Camera, DistantLight, Lambert, Mesh, Raycaster, Scene
 from tests.benchmarks.report import verdict
 
@@ -50,10 +51,10 @@ def lambert_error() -> float:
 def main() -> int:
     """Print the figures; return how many targets are missed."""
     missed = 0
-    tabulate(aspect=1.2)  # compiles
+    paper_table(Cell(1.2))  # compiles
     for aspect in (0.5, 1.9):
         started = time.perf_counter()
-        table = tabulate(aspect=aspect)
+        table = paper_table(Cell(aspect))
         missed += verdict(f"table of all directions, aspect {aspect:g}", time.perf_counter() - started, 10, " s")
         for name, error in table.in_plane_error().items():
             if name.startswith("u"):

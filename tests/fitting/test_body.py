@@ -1,4 +1,4 @@
-"""Body light and transmission: closed forms of a flat face, balances of any face, and rays shot at hemispheres one by one."""
+"""Body light and transmission: closed forms of a flat face, balances of any face, and photons shot at petals one by one."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from scipy.stats import qmc
 
 from fitting import tracing
 from fitting.body import EDGES, THETA, BodyTrace, Epidermis, Face, Paths, gauss, hat_weights, trace_body, trace_face
+from fitting.cells import Cell, Spread
 from fitting.errors import DomainError
+from tests.fitting.photons import PARTS, Mesophyll, Side, fresnel, shoot
 
 N = 1.4
-ROSE = Epidermis(aspect=1.9)
-DOME = Epidermis(aspect=0.5)
-LENS = Epidermis(aspect=0.3, p=2.0, q=1.0, gap=0.2, depth=0.5)
-PAPILLA = Epidermis(aspect=1.0, p=1.5, q=1.2, gap=0.1, depth=0.0)
+ROSE = Epidermis(Cell(1.9))
+DOME = Epidermis(Cell(0.5))
+LENS = Epidermis(Cell(0.3, p=2.0, q=1.0, gap=0.2), depth=0.5)
+PAPILLA = Epidermis(Cell(1.0, p=1.5, q=1.2, gap=0.1), depth=0.0)
 ANGLES = np.array([0.0, 20.0, 45.0, 60.0, 80.0, 87.0])
 
 
 @pytest.fixture(scope="module")
 def flat() -> BodyTrace:
-    return trace_body(Epidermis(aspect=0.0, depth=0.7), n=N, rays=1024)
+    return trace_body(Epidermis(None, depth=0.7), n=N, rays=1024)
 
 
 @pytest.fixture(scope="module", params=[DOME, ROSE, LENS, PAPILLA], ids=["dome", "rose", "lens", "papilla"])
@@ -35,15 +37,10 @@ def petal(request: pytest.FixtureRequest) -> BodyTrace:
     return trace_body(request.param, replace(LENS, depth=1.2), n=N, rays=512, seed=3)
 
 
-def fresnel(cos_i: float, n: float) -> float:
-    """Through the angles, unlike the code under test."""
-    i = math.acos(cos_i)
-    if math.sin(i) >= n:
-        return 1.0
-    t = math.asin(math.sin(i) / n)
-    if i == 0:
-        return ((n - 1) / (n + 1)) ** 2
-    return (math.sin(i - t) ** 2 / math.sin(i + t) ** 2 + math.tan(i - t) ** 2 / math.tan(i + t) ** 2) / 2
+@pytest.fixture(scope="module")
+def garden() -> BodyTrace:
+    """Hemispheres above, rose cells with gaps below."""
+    return trace_body(Epidermis(Cell(0.5)), Epidermis(Cell(1.9, gap=0.15), depth=0.8), n=N, rays=1024)
 
 
 def internal(mu_depth: float) -> float:
@@ -141,7 +138,7 @@ def test_reflectance_and_transmittance_integrate_to_the_budget(petal: BodyTrace)
         assert stray @ weights == pytest.approx(budget["stray"], rel=0.2, abs=4e-4)  # linear between nodes 10 deg apart
         through = petal.transmittance(theta_i, theta_r - 180, mu=0.2, R_m=0.5, T_m=0.2, D_m=0.2)
         assert through @ weights == pytest.approx(budget["scattered"] + budget["direct"], rel=2e-3)
-        if theta_i or petal.upper.epidermis.q > 1:  # else all normals that mirror lie within a narrow cone
+        if theta_i or petal.upper.epidermis.cell.q > 1:  # else all normals that mirror lie within a narrow cone
             mirrored = petal.mirror_reflectance(theta_i, theta_r[:, None], phi, turns=24).mean(1)
             assert mirrored @ weights == pytest.approx(budget["mirror"], rel=0.1, abs=3e-4)
         whole = petal.reflectance(theta_i, theta_r[:, None], phi, turns=24, mu=0.2, R_m=0.5, T_m=0.2, D_m=0.2).mean(1)
@@ -203,10 +200,11 @@ def test_faces_differ(petal: BodyTrace) -> None:
     assert abs(lit - other) > 1e-3
 
 
-def volume(cell: Epidermis) -> float:
+def volume(face: Epidermis) -> float:
     """Of pigmented cell over an area of petal, a."""
-    dome = 2 * math.pi * quad(lambda r: r * cell.height * (1 - r**cell.p) ** (1 / cell.q), 0, 1)[0]
-    return cell.depth + dome / (cell.pitch**2 * math.sqrt(3) / 2)
+    cell = face.cell or Cell()
+    dome = 2 * math.pi * quad(lambda r: r * float(cell.profile(r)), 0, 1)[0]
+    return face.depth + dome / cell.cell_area
 
 
 def mean_path(paths: Paths) -> np.ndarray:
@@ -222,24 +220,25 @@ def test_paths_fill_the_volume(petal: BodyTrace) -> None:
     assert total == pytest.approx(4 * N**2 * volume(face.epidermis), rel=1e-2)
 
 
-@pytest.mark.parametrize("cell", [ROSE, PAPILLA, LENS])
-def test_straight_paths(cell: Epidermis) -> None:
+@pytest.mark.parametrize("face", [ROSE, PAPILLA, LENS])
+def test_straight_paths(face: Epidermis) -> None:
     """With an index of all but 1 nothing bends: the mean path is volume over cosine, many domes included."""
     angles = np.radians([0.0, 30.0, 60.0, 80.0])
     rays = 4096
-    theta = np.broadcast_to(angles[:, None], (4, rays)).copy()
-    points = qmc.Sobol(3, seed=1).random(rays)
-    shape = (cell.height, cell.p, cell.q, cell.pitch, cell.depth, 1 + 1e-6, np.array(EDGES), 4)
-    reached, escaped, shares, _ = tracing.trace_down(theta, points, np.zeros((4, 3)), 0, *shape, (2, 2))
-    assert escaped[..., 0].sum() + shares.sum() < 1e-4 * rays
-    paths = gauss(reached / rays)
+    points = qmc.Sobol(4, seed=1).random(rays)
+    layer = tracing.Layer(tracing.Domes.of(face.cell), face.depth, 1 + 1e-6, np.array(EDGES))
+    tally = tracing.Tally.empty(4, 4, len(EDGES))
+    for k, angle in enumerate(angles):
+        tracing.trace_down(np.full(rays, angle), points, np.zeros(4), 0, layer, tally.row(k))
+    assert tally.escaped[..., 0].sum() + tally.shares.sum() < 1e-4 * rays
+    paths = gauss(tally.reached / rays)
     np.testing.assert_allclose(paths(0.0).sum(1), 1, atol=1e-4)
-    np.testing.assert_allclose(mean_path(paths).sum(1), volume(cell) / np.cos(angles), rtol=4e-3)
+    np.testing.assert_allclose(mean_path(paths).sum(1), volume(face) / np.cos(angles), rtol=4e-3)
 
 
 def test_lone_dome_mirrors_as_a_sphere() -> None:
     """Far apart, a hemisphere sends F / 4 per solid angle and cross-section into every direction that its normals reach."""
-    petal = trace_body(Epidermis(aspect=0.5, gap=30.0, depth=1.0), n=N, rays=64)
+    petal = trace_body(Epidermis(Cell(0.5, gap=30.0)), n=N, rays=64)
     area = (2 * 31) ** 2 * math.sqrt(3) / 2
     for theta_i, theta_r, phi in ((0, 0, 0), (40, 40, 180), (40, 40, 0), (10, 60, 120)):
         i, r = np.radians(theta_i), np.radians(theta_r)
@@ -248,69 +247,59 @@ def test_lone_dome_mirrors_as_a_sphere() -> None:
         assert petal.mirror_reflectance(theta_i, theta_r, phi) == pytest.approx(expected, rel=1e-9, abs=0)
 
 
-def first_sphere(x: np.ndarray, d: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Way to the nearest unit sphere above the floor from outside, and which."""
-    e = centres[None] - x[:, None]
-    ahead = np.einsum("rck,rk->rc", e, d)
-    under = ahead**2 - (e**2).sum(-1) + 1
-    t = ahead - np.sqrt(np.maximum(under, 0))
-    t[(under < 0) | (t < 1e-7) | (x[:, None, 2] + t * d[:, None, 2] < 0)] = np.inf
-    return t.min(1), t.argmin(1)
-
-
 @pytest.mark.slow
-def test_against_rays_shot_at_hemispheres_one_by_one() -> None:
-    """Whole rays, one random choice a wall, an explicit patch of spheres: no cell, no splitting, no code in common."""
-    rng = np.random.default_rng(5)
-    theta, mu, rays = math.radians(50), 0.6, 12_000
-    i, j = (g.ravel() for g in np.meshgrid(np.arange(-9, 10), np.arange(-9, 10)))
-    centres = np.column_stack([2 * i + j, math.sqrt(3) * j, 0 * i]).astype(float)
-    u, v, azimuth = rng.random((3, rays))
-    d = -np.column_stack(
-        [np.sin(theta) * np.cos(2 * np.pi * azimuth), np.sin(theta) * np.sin(2 * np.pi * azimuth), np.full(rays, np.cos(theta))]
-    )
-    x = np.column_stack([2 * u + v, math.sqrt(3) * v, np.ones(rays)])
-    within, path, walls, reached, single = np.full(rays, -1), np.zeros(rays), np.zeros(rays, int), np.zeros(rays), 0
-    alive = np.arange(rays)
-    while len(alive):
-        a, w = alive, within[alive]
-        outside = w < 0
-        t, sphere = np.full(len(a), np.inf), w.copy()
-        t[outside], sphere[outside] = first_sphere(x[a[outside]], d[a[outside]], centres)
-        own = x[a] - centres[w]
-        ahead = (own * d[a]).sum(1)
-        t[~outside] = (np.sqrt(np.maximum(0, ahead**2 + 1 - (own**2).sum(1))) - ahead)[~outside]
-        with np.errstate(divide="ignore"):
-            floor = np.where(d[a, 2] < 0, -x[a, 2] / d[a, 2], np.inf)
-        at_floor = floor <= t
-        t = np.minimum(t, floor)
-        gone = np.isinf(t)
-        single += np.count_nonzero(gone & (walls[a] == 1))
-        t[gone] = 0
-        x[a] += t[:, None] * d[a]
-        path[a] += np.where(outside, 0, t)
-        base = at_floor & ~outside
-        reached[a[base]] = np.exp(-mu * (path[a] + 1 / -np.minimum(d[a, 2], -1e-12)))[base]
-        keep = ~gone & ~base
-        a, w, sphere, at_floor = a[keep], w[keep], sphere[keep], at_floor[keep]
-        normal = np.where(at_floor[:, None], [0.0, 0.0, 1.0], x[a] - centres[sphere])
-        normal[w >= 0] *= -1
-        cos = -(normal * d[a]).sum(1)
-        n = np.where(w >= 0, 1 / N, N)
-        reflects = rng.random(len(a)) < [fresnel(min(1.0, max(0.0, c)), m) for c, m in zip(cos, n, strict=True)]
-        cos_t = np.sqrt(np.maximum(0, 1 - (1 - cos**2) / n**2))
-        bent = d[a] / n[:, None] + (cos / n - cos_t)[:, None] * normal
-        d[a] = np.where(reflects[:, None], d[a] + 2 * cos[:, None] * normal, bent)
-        walls[a] += np.where(reflects & ~at_floor & (walls[a] == 0), 1, 2)
-        down = at_floor & ~reflects
-        reached[a[down]] = np.exp(mu / d[a[down], 2])
-        within[a] = np.where(reflects, w, np.where(w >= 0, -1, sphere))
-        alive = a[~down]
-    face = trace_body(DOME, n=N, rays=1024).upper
-    sigma = reached.std() / math.sqrt(rays)
-    assert face.down(mu)[50].sum() == pytest.approx(reached.mean(), abs=4 * sigma)
-    assert sigma < 0.002
-    assert face.single[50] == pytest.approx(single / rays, abs=4 * math.sqrt(single) / rays)
+@pytest.mark.parametrize("theta", [20.0, 65.0])
+@pytest.mark.parametrize("over", [False, True], ids=["above", "below"])
+@pytest.mark.parametrize(
+    "tissue",
+    [
+        {"mu": 0.0, "mu_below": 0.0, "R_m": 0.5, "R_m_below": 0.5, "T_m": 0.5, "D_m": 0.0},
+        {"mu": 0.05, "mu_below": 0.3, "R_m": 0.6, "R_m_below": 0.4, "T_m": 0.4, "D_m": 0.0},
+        {"mu": 0.6, "mu_below": 0.2, "R_m": 0.4, "R_m_below": 0.3, "T_m": 0.3, "D_m": 0.2},
+    ],
+    ids=["clear", "pale", "dark"],
+)
+def test_pigment_chosen_afterwards_is_pigment_traced(garden: BodyTrace, theta: float, over: bool, tissue: dict[str, float]) -> None:
+    """One trace for all, against photons that are absorbed on their way: where each ends, and under which angle it leaves."""
+    count = 150_000
+    sides = [Side(1.0, 2.0, 1.0, tissue["mu"]), Side(3.8, 2.3, 0.8, tissue["mu_below"])]
+    reflected = [tissue["R_m"], tissue["R_m_below"]]
+    petal = garden.turned_over() if over else garden
+    if over:
+        sides.reverse()
+        reflected.reverse()
+        tissue = tissue | {"mu": sides[0].mu, "mu_below": sides[1].mu, "R_m": reflected[0], "R_m_below": reflected[1]}
+    ends, cosines = shoot(theta, count, *sides, N, Mesophyll(*reflected, tissue["T_m"], tissue["D_m"]), 4)
+    assert np.all(ends >= 0)
+    budget = petal.budget(theta, **tissue)
+    for number, part in enumerate(PARTS):
+        share = float(budget[part])
+        # Four standard deviations, and what 1024 rays a node leave in error.
+        assert np.mean(ends == number) == pytest.approx(share, abs=4 * math.sqrt(max(share, 1 / count) / count) + 0.004 * share + 1e-4), (
+            part
+        )
+    edges = np.linspace(0, 1, 6)
+    u, w = np.polynomial.legendre.leggauss(12)
+    for part, seen in (
+        ("body", lambda view: petal.body_reflectance(theta, view, **tissue)),
+        ("scattered", lambda view: petal.transmittance(theta, view - 180, direct=False, **tissue)),
+    ):
+        counted = np.histogram(cosines[ends == PARTS.index(part)], edges)[0] / count
+        for low, high, found in zip(edges, edges[1:], counted, strict=False):
+            cos = low + (high - low) * (u + 1) / 2
+            expected = math.pi * (high - low) * float((seen(np.degrees(np.arccos(cos))) * cos) @ w)
+            assert found == pytest.approx(expected, abs=4 * math.sqrt(expected / count) + 0.015 * expected + 1e-4)
+
+
+def test_threads_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = np.linspace(0, 80, 2000)
+    found = []
+    for cores in (1, 5):
+        monkeypatch.setattr("os.cpu_count", lambda cores=cores: cores)
+        petal = trace_body(DOME, n=N, rays=64)
+        found.append([*petal.arrays().values(), petal.mirror_reflectance(30.0, views)])
+    for one, five in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, five)
 
 
 @settings(max_examples=150)
@@ -324,6 +313,7 @@ def test_against_rays_shot_at_hemispheres_one_by_one() -> None:
 def test_way_to_a_wall_against_small_steps(
     h: float, p: float, q: float, start: tuple[float, float, float], towards: tuple[float, float, float]
 ) -> None:
+    domes = tracing.Domes(h, p, q, 2.0)
     x, d = np.array(start) * [1, 1, h], np.array(towards)
     length = np.linalg.norm(d)
     if length < 0.1:
@@ -335,20 +325,20 @@ def test_way_to_a_wall_against_small_steps(
     end = -x[2] / d[2] if d[2] < 0 else 12.0
     inside = (at[:, 2] >= 0) & (steps <= end) & ((np.maximum(at[:, 2], 0) / h) ** q + np.hypot(at[:, 0], at[:, 1]) ** p < 1 - 1e-6)
     if inside[0]:
-        t, base = tracing.leave(*x, *d, h, p, q)
+        t, base = tracing.leave(*x, *d, domes)
         assert t == pytest.approx(steps[inside.nonzero()[0][-1]], abs=0.02)
         if base:
             assert x[2] + t * d[2] == pytest.approx(0, abs=1e-9)
         else:
-            assert tracing.wall(*(x + t * d), *d, h, p, q)[0] == pytest.approx(0, abs=1e-9)
+            assert tracing.wall(*(x + t * d), *d, domes)[0] == pytest.approx(0, abs=1e-9)
         return
-    if tracing.wall(*x, *d, h, p, q)[0] <= 0:
+    if tracing.wall(*x, *d, domes)[0] <= 0:
         return
-    t = tracing.enter(*x, *d, h, p, q, min(end, 12.0))
+    t = tracing.enter(*x, *d, domes, min(end, 12.0))
     if inside.any():
         assert 0 <= t <= steps[inside.nonzero()[0][0]] + 1e-9
     if t >= 0:
-        assert tracing.wall(*(x + t * d), *d, h, p, q)[0] == pytest.approx(0, abs=1e-6)
+        assert tracing.wall(*(x + t * d), *d, domes)[0] == pytest.approx(0, abs=1e-6)
 
 
 @given(seed=st.integers(0, 2**32), mu=st.floats(0, 20))
@@ -386,7 +376,7 @@ def test_same_seed_same_trace_and_back_from_a_file(tmp_path: Path) -> None:
     with np.load(tmp_path / "petal.npz") as file:
         arrays = dict(file)
     back = BodyTrace.from_arrays(arrays, petal.provenance)
-    assert back.upper.epidermis == petal.upper.epidermis
+    assert (back.upper.epidermis, back.lower.epidermis) == (DOME, LENS)
     view = np.linspace(-80, 80, 17)
     tissue = {"mu": 0.4, "R_m": 0.5, "T_m": 0.3}
     np.testing.assert_array_equal(back.reflectance(45.0, view, **tissue), petal.reflectance(45.0, view, **tissue))
@@ -396,9 +386,11 @@ def test_same_seed_same_trace_and_back_from_a_file(tmp_path: Path) -> None:
 
 
 def test_what_the_model_does_not_describe_is_refused(flat: BodyTrace) -> None:
-    for wrong in ({"aspect": -1.0}, {"p": 0.5}, {"q": math.nan}, {"gap": -0.1}, {"depth": math.inf}):
-        with pytest.raises(DomainError, match=next(iter(wrong))):
-            Epidermis(**wrong)
+    for depth in (-1.0, math.inf, math.nan):
+        with pytest.raises(DomainError, match="depth"):
+            Epidermis(Cell(), depth)
+    with pytest.raises(DomainError, match="all alike"):
+        Epidermis(Cell(gap=0.2, spread=Spread(place=0.1)))
     for wrong in ({"n": 1.0}, {"rays": 1000}, {"rays": 32}):
         with pytest.raises(DomainError, match=r"refractive index|power of 2"):
             trace_body(DOME, **wrong)
@@ -411,9 +403,9 @@ def test_what_the_model_does_not_describe_is_refused(flat: BodyTrace) -> None:
         flat.reflectance(30.0, 95.0, mu=0.0, R_m=0.5, T_m=0.4)
     with pytest.raises(DomainError, match="above 90"):
         flat.transmittance(30.0, 60.0, mu=0.0, R_m=0.5, T_m=0.4)
-    flat_top = BodyTrace(replace(flat.upper, epidermis=Epidermis(p=3.0, q=3.0)), flat.lower)
+    flat_top = BodyTrace(replace(flat.upper, epidermis=Epidermis(Cell(p=3.0, q=3.0))), flat.lower)
     with pytest.raises(DomainError, match="flat at the top"):
         flat_top.mirror_reflectance(30.0, -30.0)
-    cone = BodyTrace(replace(flat.upper, epidermis=Epidermis(p=1.0, q=1.0)), flat.lower)
+    cone = BodyTrace(replace(flat.upper, epidermis=Epidermis(Cell(p=1.0, q=1.0))), flat.lower)
     with pytest.raises(DomainError, match="cones"):
         cone.mirror_reflectance(30.0, -30.0)

@@ -14,11 +14,13 @@ from scipy.stats import chi2
 from scipy.stats.qmc import Sobol
 
 from fitting import DomainError
-from fitting.table import INTENSITY, PER_SR, Grid, Reflectance, ReflectanceTable, tabulate
+from fitting.cells import Cell
+from fitting.reflectance import INTENSITY, PER_SR, Reflectance
+from fitting.table import Grid, ReflectanceTable, paper_table, radiometric_table
 
 THETA = np.concatenate([np.arange(0, 84.0, 4), [84, 86.5, 88.5, 90]])
 PHI = np.linspace(0, 180, 25)
-KINDS = ("lambert", "black", "mirror", "spot", "petal")
+KINDS = ("lambert", "black", "mirror", "spot", "petal", "petal in 1/sr")
 incidences = st.floats(0, 90)
 below_one = st.floats(0, 1, exclude_max=True)
 
@@ -36,13 +38,15 @@ def shades() -> dict[str, Reflectance]:
     mirror = np.maximum(0, np.cos(i) * np.cos(r) - np.sin(i) * np.sin(r) * np.cos(p))
     spot = np.zeros((len(THETA), len(THETA), len(PHI)))
     spot[:, 9, 14] = 1  # dark all round
-    petal = tabulate(aspect=1.2, grid=Grid(theta_steps=15, phi_steps=18, rows=40, columns=72, turns=6))
+    petal = paper_table(Cell(1.2), grid=Grid(theta_steps=15, phi_steps=18))
+    tall = radiometric_table(Cell(1.9), grid=Grid(theta_steps=15, phi_steps=18))
     return {
         "lambert": one(0.8 / math.pi),
         "black": one(0.0),
         "mirror": one(42 / (2 * math.pi) * mirror**40),
         "spot": one(spot, INTENSITY),
         "petal": petal.mixed({"u_diff": 0.3, "u_spec": 0.8, "s_diff": 0.05, "s_spec": 0.2}),
+        "petal in 1/sr": tall.mixed({"u_diff": 0.3, "u_spec": 0.3, "s_diff": 0.05, "s_spec": 0.1}),
     }
 
 
@@ -79,7 +83,7 @@ def test_lambert_is_drawn_by_the_cosine(shades: dict[str, Reflectance]) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("theta_i", [0, 31.7, 75])
+@pytest.mark.parametrize("theta_i", [0, 13.1, 31.7, 47, 60, 75, 86, 88.7, 89.9, 90])
 def test_drawn_directions_are_as_dense_as_the_density_says(kind: str, theta_i: float, shades: dict[str, Reflectance]) -> None:
     """Chi-square over bins that are not the table's own."""
     count = 200_000

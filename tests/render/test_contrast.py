@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fitting.table import Grid, tabulate
+from fitting.cells import Cell
+from fitting.table import Grid, paper_table
 from render import Camera, Lambert, Picture, Raycaster, RenderError, measure_contrast
 from render.raycast import Shading
 
@@ -47,7 +48,7 @@ def test_of_a_lambert_sphere(matt: Picture) -> None:
 
 
 def test_domes_against_gloss(ball: Raycaster) -> None:
-    table = tabulate(aspect=1.9, grid=Grid(15, 18, 40, 72, 6))
+    table = paper_table(Cell(1.9), grid=Grid(15, 18))
     found = {}
     for name in ("u_diff", "s_spec"):
         shading = table.mixed({"u_diff": 0.0, "u_spec": 0.0, "s_diff": 0.0, "s_spec": 0.0} | {name: 1.0})

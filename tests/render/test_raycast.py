@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fitting.table import Grid, tabulate
+from fitting.cells import Cell
+from fitting.table import Grid, paper_table
 from render import Camera, DistantLight, Lambert, Mesh, NearLight, Raycaster, RenderError, Scene
 
 from .conftest import sheet
@@ -140,7 +141,7 @@ def test_the_shading_gets_the_angles_of_the_surface(floor: Raycaster) -> None:
 
 def test_the_paper_model_on_a_plane(floor: Raycaster) -> None:
     """Radiance is the mixture's intensity with no further cosine, eq. (8)."""
-    table = tabulate(aspect=1.9, grid=Grid(15, 18, 40, 72, 6))
+    table = paper_table(Cell(1.9), grid=Grid(15, 18))
     reflectance = table.mixed({"u_diff": 0.3, "u_spec": 0.5, "s_diff": 0.2, "s_spec": 0.1})
     camera = Camera.look_at((500, 0, 500), (0, 0, 0), fov=0.1, width=4, height=4)
     picture = floor.picture(camera, reflectance, light=DistantLight((0, 0, 1), intensity=2))

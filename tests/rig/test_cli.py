@@ -197,8 +197,8 @@ def test_model_eval_knows_other_cells_and_directions(rig) -> None:
     assert there.pop("theta_r_deg") == 50
     assert back.pop("theta_r_deg") == 20
     assert there == pytest.approx(back)  # reciprocal
-    assert list(there) == ["diff", "spec"]
-    assert 0 < there["diff"] < 1 / 3.14
+    assert list(there) == ["u_diff", "u_spec", "s_diff", "s_spec"]
+    assert 0 < there["u_diff"] < there["s_diff"] == pytest.approx(1 / math.pi, rel=1e-5)
     assert one("--theta-r", "50", *papilla)["s_diff"] == pytest.approx(0.5**0.5, rel=1e-5)
 
 
