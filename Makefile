@@ -23,7 +23,7 @@ demo: use
 	@.venv/bin/rig demo
 
 test: dev
-	@$(PY) -m pytest
+	@$(PY) -m pytest -n auto --maxprocesses=4 --dist=loadfile
 
 lint: dev
 	@$(PY) -m ruff check .

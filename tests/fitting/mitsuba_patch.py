@@ -69,8 +69,8 @@ def mitsuba() -> Any:
 
     if library := llvm_library():
         os.environ["DRJIT_LIBLLVM_PATH"] = library
-        mi.set_variant("llvm_ad_rgb")
         try:
+            mi.set_variant("llvm_ad_rgb")
             float(mi.Float([1.0, 2.0])[1])
             return mi
         except Exception as error:  # what Dr.Jit raises where its library is of no use differs

@@ -44,7 +44,7 @@ def opaque(patch: tuple[Cell, Patch]) -> tuple[Cell, Opaque]:
 
 def points() -> int:
     """Of each azimuth; ray by ray it is slow."""
-    return 4000 if vectorised() else 500
+    return 4000 if vectorised() else 2000
 
 
 def test_paper_mode(opaque: tuple[Cell, Opaque]) -> None:
@@ -78,7 +78,8 @@ def test_interreflection_order_by_order_and_all_together(opaque: tuple[Cell, Opa
     traced = escape_orders(cell, [45, 60], [20, 50], [75, 180], rays=1024)
     for direction, nodes in (((45.0, 20.0, 75.0), (0, 0, 0)), ((60.0, 50.0, 180.0), (1, 1, 1))):
         found = domes.orders(direction, 3, strata=16, rays=8192)
-        assert np.all(found.error < 0.02 * found.mean), found
+        # Ray by ray the differences of orders are noisier.
+        assert np.all(found.error < (0.02 if vectorised() else 0.04) * found.mean), found
         found.check(traced.bases[:3][(slice(None), *nodes)], 0.03, f"{cell} {direction}, orders 1 to 3")
         every = domes.reflectance(direction, bounces=-1, albedo=0.8, strata=16, rays=4096)
         every.check(traced.reflectance(0.8)[nodes], 0.02, f"{cell} {direction}, albedo 0.8")
