@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import qmc
 
 from fitting import tracing
-from fitting.body import EDGES, THETA, BodyTrace, Epidermis, Face, Paths, gauss, hat_weights, trace_body, trace_face
+from fitting.body import EDGES, STREAMS, THETA, BodyTrace, Epidermis, Face, Paths, gauss, hat_weights, trace_body, trace_face
 from fitting.cells import Cell, Spread
 from fitting.errors import DomainError
 from tests.fitting.photons import PARTS, Mesophyll, Side, fresnel, shoot
@@ -57,7 +57,7 @@ def test_flat_surface_is_fresnel_and_saunderson(flat: BodyTrace) -> None:
     np.testing.assert_allclose(np.interp(ANGLES, THETA, flat.upper.down(0.0).sum(1)), outward(ANGLES), atol=1e-3)
     np.testing.assert_allclose(flat.budget(ANGLES, mu=0.0, R_m=0.5, T_m=0.0)["floor"], 1 - outward(ANGLES), atol=1e-3)
     # What Saunderson calls k2, by its own integral and by 1 - (1 - k1) / n^2.
-    assert flat.upper.back(0.0).sum() / 16 == pytest.approx(internal(0.0), abs=2e-4)
+    assert flat.upper.back(0.0).sum() / STREAMS == pytest.approx(internal(0.0), abs=2e-4)
     k1 = quad(lambda u: fresnel(math.sqrt(1 - u), N), 0, 1)[0]
     assert internal(0.0) == pytest.approx(1 - (1 - k1) / N**2, abs=1e-6)
 
@@ -76,7 +76,7 @@ def test_flat_pigment_is_beer_lambert(flat: BodyTrace, mu: float) -> None:
     slant = np.sqrt(1 - (np.sin(np.radians(ANGLES)) / N) ** 2)
     found = np.interp(ANGLES, THETA, flat.upper.down(mu).sum(1))
     np.testing.assert_allclose(found, outward(ANGLES) * np.exp(-mu * 0.7 / slant), rtol=2e-3, atol=1e-3)
-    assert flat.upper.back(mu).sum() / 16 == pytest.approx(internal(mu * 0.7), abs=2e-4)
+    assert flat.upper.back(mu).sum() / STREAMS == pytest.approx(internal(mu * 0.7), abs=2e-4)
 
 
 def test_clear_flat_petal_is_a_slab(flat: BodyTrace) -> None:
@@ -216,7 +216,7 @@ def test_paths_fill_the_volume(petal: BodyTrace) -> None:
     face = petal.upper
     w = hat_weights()
     # In and, reciprocally, out; stray light; and what comes back to the mesophyll.
-    total = 2 * w @ mean_path(face.down).sum(1) + w @ mean_path(face.astray) + N**2 * mean_path(face.back).sum() / 16
+    total = 2 * w @ mean_path(face.down).sum(1) + w @ mean_path(face.astray) + N**2 * mean_path(face.back).sum() / STREAMS
     assert total == pytest.approx(4 * N**2 * volume(face.epidermis), rel=1e-2)
 
 
