@@ -44,7 +44,7 @@ class Quadrature:
         Nodes over the slice's place and the lattice's azimuth; an odd Fibonacci number from 89 on (89, 233, 377, 987, 1597, 4181, ...).
         With 1597, all values above a thousandth of their term's peak are within 0.04 % at the paper's 15 directions and within 0.2 % while
         theta_i and theta_r stay within 70 deg; at 85 deg u_diff is within 1.1 % and the faint u_spec within 8 %. With 377, within 0.3 % at
-        the paper's directions in a quarter of the time. `tests/benchmarks/bench_model.py` prints the table.
+        the paper's directions in less than half of the time. `tests/benchmarks/bench_model.py` prints the table.
     lobe : int
         Gauss-Legendre nodes across the specular lobe on each slice.
 

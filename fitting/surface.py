@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -312,44 +313,115 @@ def bits_set(word: np.uint64) -> np.uint64:
 
 
 @njit(cache=True, nogil=True)
+def power(x: float, exponent: float) -> float:
+    """Raise to a power; whole exponents, the usual ones, by squaring, several times quicker."""
+    whole = int(exponent)
+    if whole != exponent or whole > 4096:
+        return x**exponent
+    out = 1.0
+    while whole:
+        if whole & 1:
+            out *= x
+        x *= x
+        whole >>= 1
+    return out
+
+
+class Facets(NamedTuple):
+    """Sample points in groups whose normals make the same angle with z; lengths in a.
+
+    Attributes
+    ----------
+    points : ndarray, shape (b, g, 3)
+        At most 64 to a group, from the lattice's place of their dome, in the lattice's frame.
+    azimuths : ndarray, shape (b, g), rad
+        Of their normals.
+    out, up, areas : ndarray, shape (b,)
+        Horizontal and vertical part of the unit normal, and the area that the group stands for, per area of patch.
+    sites, own : ndarray of int and of bool, shape (b,)
+        Row of `Cell.domes`, and whether the points lie on that dome or on the floor.
+    offsets : ndarray, shape (b,)
+        Of the directions around them, 0 to 1 step.
+    """
+
+    points: Array
+    azimuths: Array
+    out: Array
+    up: Array
+    areas: Array
+    sites: Ints
+    own: NDArray[np.bool_]
+    offsets: Array
+
+
+@njit(cache=True, nogil=True)
+def _views_of(
+    group: int,
+    remainder: float,
+    theta: Array,
+    facets: Facets,
+    domes: Array,
+    shape: tuple[float, float, float, float, float],
+    words: NDArray[np.uint64],
+    cosines: Array,
+) -> None:
+    """Which points of a group each direction sees, as bits, and its cosine to their normals; both of shape (AROUND, t)."""
+    pitch, p, q, top, wide = shape
+    around, count = len(words), facets.points.shape[1]
+    step = 2 * math.pi / around
+    slopes = np.empty(count)
+    for j in range(around):
+        away = (j + facets.offsets[group]) * step - remainder
+        for n in range(count):
+            x, y, z = facets.points[group, n]
+            psi = facets.azimuths[group, n] - away
+            slopes[n] = horizon(x, y, z, facets.sites[group], facets.own[group], psi, domes, pitch, p, q, top, wide)
+        ahead = facets.out[group] * math.cos(away)
+        for t in range(len(theta)):
+            sin, cos = math.sin(theta[t]), math.cos(theta[t])
+            word = np.uint64(0)
+            cosines[j, t] = ahead * sin + facets.up[group] * cos
+            if cosines[j, t] > 0:
+                for n in range(count):
+                    word |= np.uint64(slopes[n] * sin < cos) << np.uint64(n)
+            words[j, t] = word
+
+
+@njit(cache=True, nogil=True)
 def facet_sums(
-    phi: float,
-    theta_i: Array,
-    theta_r: Array,
-    begins: Ints,
-    views: Ints,
-    points: Array,
-    normals: Array,
-    areas: Array,
-    sites: Ints,
-    own: NDArray[np.bool_],
-    offsets: Array,
-    turns: int,
-    period: float,
+    around: int,
+    remainder: float,
+    steps: Ints,
+    runs: Ints,
+    theta: Array,
+    light: Ints,
+    view: Ints,
+    facets: Facets,
     domes: Array,
     shape: tuple[float, float, float, float, float],
     exponent: float,
     floor: float,
     foreshortened: bool,
 ) -> Array:
-    """Sum what facets send from light into views, over the azimuth of the lattice, for one azimuth between light and view.
+    """Sum what facets send from light into views, over the azimuth of the lattice, for azimuths phi a whole number of steps apart.
 
     Parameters
     ----------
-    phi : float, rad
-        The light stands at azimuth -phi / 2, the view at phi / 2. Each facet counts twice, the second time as in a mirror that swaps
-        the two: so that light and view may be swapped exactly.
-    theta_i, theta_r : ndarray, rad
+    around : int
+        Each group of facets is lit and seen from that many azimuths, even steps apart.
+    remainder : float, rad
+        phi = step 2 pi / around + remainder.
+    steps : ndarray of int, shape (m,)
+        One for each run of pairs.
+    runs : ndarray of int, shape (m + 1,)
+        Run n is made of the pairs runs[n] to runs[n + 1], which have the light in common.
+    theta : ndarray, shape (t,), rad
         Lights and views, 0 to below pi / 2.
-    begins, views : ndarray of int, shapes (i + 1,), (n,)
-        Light i is seen from the views `views[begins[i] : begins[i + 1]]`, rows of `theta_r`.
-    points, normals, areas, sites, own, offsets
-        Of the facets. Those of domes (`own`) from their place in the lattice, in the frame of light and view; those of the floor in the
-        lattice's frame. Offsets shift the lattice's azimuths, 0 to 1.
-    turns, period : int, float
-        Azimuths of the lattice, at most 64: (n + offset) period / turns [rad].
-    domes, shape
-        As `horizons`.
+    light, view : ndarray of int, shape (n,)
+        Pairs, as rows of `theta`. Each pair counts twice, the second time with light and view in each other's place: so that they may be
+        swapped exactly.
+    facets, domes, shape
+        As `horizon`.
     exponent, floor : float
         Of the specular lobe; cosine of the angle from which on it is taken as 0.
     foreshortened : bool
@@ -360,60 +432,40 @@ def facet_sums(
     ndarray, shape (n, 2)
         Sum of area x N.L (x N.V); sum of area (x N.L x N.V) x lobe; mean over the azimuths.
     """
-    pitch, p, q, top, wide = shape
-    out = np.zeros((len(views), 2))
-    tan_i, tan_r = np.tan(theta_i), np.tan(theta_r)
-    sin_i, cos_i, sin_r, cos_r = np.sin(theta_i), np.cos(theta_i), np.sin(theta_r), np.cos(theta_r)
-    cos_half, sin_half = math.cos(phi / 2), math.sin(phi / 2)
-    cos_phi = math.cos(phi)
-    before, after = np.empty(turns), np.empty(turns)
-    seen = np.empty(len(theta_r), np.uint64)
-    cos_v = np.empty(len(theta_r))
-    for f in range(len(areas)):
-        px, py, z = points[f]
-        dx, dy = domes[sites[f], 0], domes[sites[f], 1]
-        for n in range(turns):
-            azimuth = (n + offsets[f]) * period / turns
-            if own[f]:
-                cos, sin = math.cos(azimuth), math.sin(azimuth)
-                x, y = cos * px + sin * py + dx, cos * py - sin * px + dy
-            else:
-                x, y = px, py
-            after[n] = horizon(x, y, z, sites[f], own[f], phi / 2 - azimuth, domes, pitch, p, q, top, wide)
-            before[n] = after[n] if phi == 0 else horizon(x, y, z, sites[f], own[f], -phi / 2 - azimuth, domes, pitch, p, q, top, wide)
-        nx, nz = normals[f, 0], normals[f, 2]
-        for mirror in range(2):
-            ny = normals[f, 1] if mirror == 0 else -normals[f, 1]
-            towards_l, towards_v = (before, after) if mirror == 0 else (after, before)
-            ahead_l, ahead_v = nx * cos_half - ny * sin_half, nx * cos_half + ny * sin_half
-            weight = areas[f] / (2 * turns)
-            for r in range(len(theta_r)):
-                word = np.uint64(0)
-                cos_v[r] = ahead_v * sin_r[r] + nz * cos_r[r]
-                if cos_v[r] > 0:
-                    for n in range(turns):
-                        word |= np.uint64(towards_v[n] * tan_r[r] < 1) << np.uint64(n)
-                seen[r] = word
-            for i in range(len(theta_i)):
-                cos_l = ahead_l * sin_i[i] + nz * cos_i[i]
-                if cos_l <= 0:
+    out = np.zeros((len(view), 2))
+    here, there = np.empty((around, len(theta)), np.uint64), np.empty((around, len(theta)), np.uint64)
+    cos_here, cos_there = np.empty((around, len(theta))), np.empty((around, len(theta)))
+    sin, cos = np.sin(theta), np.cos(theta)
+    for group in range(len(facets.areas)):
+        _views_of(group, 0.0, theta, facets, domes, shape, here, cos_here)
+        if remainder == 0:
+            there, cos_there = here, cos_here
+        else:
+            _views_of(group, remainder, theta, facets, domes, shape, there, cos_there)
+        weight = facets.areas[group] / (2 * around * facets.points.shape[1])
+        for run in range(len(steps)):
+            i = light[runs[run]]
+            cos_phi = math.cos(steps[run] * 2 * math.pi / around + remainder)
+            for j in range(2 * around):
+                if j < around:
+                    a, b = j, (j - steps[run]) % around
+                    lit, seen, cos_l, cos_v = here[a], there[b], cos_here[a, i], cos_there[b]
+                else:
+                    a, b = (j - steps[run]) % around, j - around
+                    lit, seen, cos_l, cos_v = there[a], here[b], cos_there[a, i], cos_here[b]
+                if lit[i] == 0:
                     continue
-                lit = np.uint64(0)
-                for n in range(turns):
-                    lit |= np.uint64(towards_l[n] * tan_i[i] < 1) << np.uint64(n)
-                if lit == 0:
-                    continue
-                for k in range(begins[i], begins[i + 1]):
-                    r = views[k]
-                    both = lit & seen[r]
+                for k in range(runs[run], runs[run + 1]):
+                    r = view[k]
+                    both = lit[i] & seen[r]
                     if both == 0:
                         continue
                     share = weight * bits_set(both)
                     slant = cos_l * cos_v[r]
                     out[k, 0] += share * (slant if foreshortened else cos_l)
-                    mirrored = 2 * slant - (sin_i[i] * sin_r[r] * cos_phi + cos_i[i] * cos_r[r])
+                    mirrored = 2 * slant - (sin[i] * sin[r] * cos_phi + cos[i] * cos[r])
                     if mirrored > floor:
-                        out[k, 1] += share * mirrored**exponent * (slant if foreshortened else 1.0)
+                        out[k, 1] += share * power(mirrored, exponent) * (slant if foreshortened else 1.0)
     return out
 
 
@@ -436,10 +488,11 @@ class Strata:
     out: Array
 
 
-def strata(cell: Cell, rings: int) -> Strata:
+def strata(cell: Cell, rings: int, tip: bool = False) -> Strata:
     """Cut a dome into rings which share evenly in its area and in the solid angle of its normals, half and half.
 
-    So neither the flanks nor the tip of a tall dome, which makes most of its highlight, are left with few points.
+    So neither the flanks nor the tip of a tall dome, which makes most of its highlight, are left with few points. With `tip`, one ring
+    in eleven is even in the root of the normal's angle from z: grazing light and view meet at tips only.
     """
     h, tau = cell.stretch, np.linspace(0, np.pi / 2, TABLE)
     r, z = np.sin(tau) ** (2 / cell.p), h * np.cos(tau) ** (2 / cell.q)
@@ -447,8 +500,10 @@ def strata(cell: Cell, rings: int) -> Strata:
     dr, dz = np.diff(r), np.diff(z)
     ring = np.pi * (r[1:] + r[:-1])
     up, out, area = (np.concatenate([[0.0], np.cumsum(ring * d)]) for d in (dr, -dz, np.hypot(dr, dz)))
-    turned = np.concatenate([[0.0], 1 - dr / np.hypot(dr, dz)])  # 1 - cos of the normal's angle from z
-    measure = area / area[-1] + np.maximum.accumulate(turned) / turned[-1]
+    turned = np.maximum.accumulate(np.concatenate([[0.0], 1 - dr / np.hypot(dr, dz)]))  # 1 - cos of the normal's angle from z
+    measure = area / area[-1] + turned / turned[-1]
+    if tip:
+        measure += (turned / turned[-1]) ** 0.25 / 5  # the root of the angle, near the tip
     edges, middles = np.linspace(0, measure[-1], rings + 1), (np.arange(rings) + 0.5) * measure[-1] / rings
     rho = np.sqrt(np.interp(middles, measure, up) / np.pi)
     return Strata(rho, cell.profile(rho), *(np.diff(np.interp(edges, measure, total)) for total in (up, out)))

@@ -37,9 +37,6 @@ ALBEDO_MARGIN = 0.01
 LOBE_ERROR = 0.1
 """Most that a lobe may be off between the nodes, rms, as a fraction of its mean."""
 
-TURNS = 6
-"""Azimuths of the lattice at each facet, unless asked for otherwise."""
-
 REACH = 85.0
 """Nodes of theta must come at least this near to grazing, deg; beyond the last one its value is kept."""
 
@@ -374,13 +371,11 @@ def radiometric_table(
 
 def _tabulated(cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, sampling: Sampling | None) -> ReflectanceTable:
     """Integrate at the nodes, and between some to see how far off the table is there."""
-    from fitting.radiometric import Sampling, basis_tables, radiometric_terms
+    from fitting.radiometric import LEANING, Sampling, basis_tables, radiometric_terms
 
-    # Facets are worth more than turns. In 1/sr more of them: grazing views of tall domes see their tips only, but see them large.
-    # As many to a node of any grid; each turn of a leaning dome is a facet of its own.
-    exponents, facets = {"n_us": n_us, "n_ss": n_ss}, (22 if mode == "paper" else 37) * grid.theta_steps * grid.phi_steps
-    facets //= TURNS if cell.spread.tilt > 0 else 1
-    rule = sampling or Sampling(max(facets, Sampling().points(n_us)), TURNS)
+    exponents = {"n_us": n_us, "n_ss": n_ss}
+    fine = Sampling.grazing()
+    rule = sampling or replace(fine, facets=max(fine.points(n_us), Sampling().points(n_us)))
 
     def integrate(theta: Array, phi: Array) -> Mapping[str, Array]:
         if mode == "paper":
@@ -391,7 +386,7 @@ def _tabulated(cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, samp
         terms[:, i, r] = terms[:, r, i] = half.reshape(len(i), len(phi), -1).transpose(2, 0, 1)
         return dict(zip(TERMS, terms, strict=True))
 
-    points = rule.points(n_us) * (rule.turns if cell.spread.tilt > 0 else 1)
+    points = rule.points(n_us) * (LEANING if cell.spread.tilt > 0 else 1)
     apart = 2 * math.sqrt(4 * math.pi / points)  # of mirrored rays; half of the facets are even over the normals' hemisphere
     if n_us > 0 and apart > math.acos(0.5 ** (1 / n_us)):
         raise DomainError(f"u_spec, the lobe of n_us = {n_us:g}, falls between {points} facets: ask for finer sampling")

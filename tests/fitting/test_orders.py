@@ -18,7 +18,7 @@ U, W = np.polynomial.legendre.leggauss(24)
 U, W = (U + 1) / 2, W / 2
 HEMISPHERE = np.degrees(np.arccos(U))
 
-QUICK = Sampling(800, 8)
+QUICK = Sampling(1600, 16)
 """Where it does not matter how exactly single bounce is integrated."""
 
 
