@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fitting.cells import Cell
 from fitting.errors import DomainError
+from fitting.progress import Progress, silent, stage
 
 Array = NDArray[np.float64]
 
@@ -437,7 +438,15 @@ class BodyTrace:
         return _Streams(met[..., :j], met[..., j:], sent[..., :j], sent[..., j:])
 
 
-def trace_body(upper: Epidermis, lower: Epidermis | None = None, *, n: float = 1.4, rays: int = 4096, seed: int = 0) -> BodyTrace:
+def trace_body(
+    upper: Epidermis,
+    lower: Epidermis | None = None,
+    *,
+    n: float = 1.4,
+    rays: int = 4096,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> BodyTrace:
     """Trace both faces of a petal.
 
     Parameters
@@ -451,6 +460,8 @@ def trace_body(upper: Epidermis, lower: Epidermis | None = None, *, n: float = 1
         0.3 % rms for hemispheres and 0.6 % for rose cells (aspect 1.9), up to mu = 1; the error falls by about half for four times as many.
     seed : int
         Of the shifts of the Sobol points and of small shares drawn by lot.
+    progress : callable
+        Told the share done, 0 to 1.
 
     Returns
     -------
@@ -466,11 +477,13 @@ def trace_body(upper: Epidermis, lower: Epidermis | None = None, *, n: float = 1
     if rays < 64 or rays & (rays - 1):
         raise DomainError(f"rays must be a power of 2 from 64 on, not {rays}")
     below = Epidermis(None, upper.depth) if lower is None else lower
-    faces = {face: trace_face(face, n, rays, seed) for face in {upper, below}}
+    unlike = [upper] if below == upper else [upper, below]
+    stages = [stage(progress, k / len(unlike), (k + 1) / len(unlike)) for k in range(len(unlike))]
+    faces = {face: trace_face(face, n, rays, seed, told) for face, told in zip(unlike, stages, strict=True)}
     return BodyTrace(faces[upper], faces[below], {"n": n, "rays": rays, "seed": seed})
 
 
-def trace_face(epidermis: Epidermis, n: float, rays: int, seed: int) -> Face:
+def trace_face(epidermis: Epidermis, n: float, rays: int, seed: int, progress: Progress = silent) -> Face:
     """Trace one face; parameters and errors as for `trace_body`."""
     from scipy.stats import qmc
 
@@ -482,14 +495,14 @@ def trace_face(epidermis: Epidermis, n: float, rays: int, seed: int) -> Face:
     shifts = rng.random((len(THETA), 4))
     theta = _incidences((points[:, 3] + shifts[:, 3:]) % 1)
     above = Tally.empty(len(THETA), STREAMS, len(EDGES), (STRAY[0], *STRAY))
-    on_all_cores(lambda k: trace_down(theta[k], points, shifts[k], seed + k, layer, above.row(k)), len(THETA))
+    on_all_cores(lambda k: trace_down(theta[k], points, shifts[k], seed + k, layer, above.row(k)), len(THETA), stage(progress, 0, 0.6))
     lost = above.shares[:, 2]
     kept = (rays - lost)[:, None, None, None]
     down, astray, turned = above.reached / kept, above.escaped / kept[..., 0], above.shares[:, :2] / kept[..., 0, 0]
 
     points_up, shifts_up = qmc.Sobol(4, seed=rng).random(2 * rays), rng.random((STREAMS, 4))
     below = Tally.empty(STREAMS, STREAMS, len(EDGES))
-    on_all_cores(lambda k: trace_up(k, points_up, shifts_up[k], seed + k, layer, below.row(k)), STREAMS)
+    on_all_cores(lambda k: trace_up(k, points_up, shifts_up[k], seed + k, layer, below.row(k)), STREAMS, stage(progress, 0.6, 1))
     lost_up = below.shares[:, 2]
     back = below.reached / (2 * rays - lost_up)[:, None, None, None]
     back = (back + back.swapaxes(0, 1)) / 2

@@ -24,6 +24,7 @@ from fitting.body import BodyTrace, Epidermis, trace_body
 from fitting.cells import Cell, Spread
 from fitting.errors import DomainError, TableError
 from fitting.paper import TERMS
+from fitting.progress import Progress, silent, stage
 from fitting.reflectance import PER_SR, Reflectance
 from fitting.scattering import Scattering
 from fitting.table import Grid, ReflectanceTable, paper_table, radiometric_table
@@ -275,6 +276,7 @@ def build(
     depth: float = 1.0,
     n: float = 1.4,
     seed: int = 0,
+    progress: Progress = silent,
 ) -> Model:
     """Work out what does not depend on the cultivar: some seconds on two cores.
 
@@ -296,6 +298,8 @@ def build(
         Refractive index of cells and mesophyll.
     seed : int
         Of the rays' places; in "interreflecting" too.
+    progress : callable
+        Told the share done, 0 to 1.
 
     Raises
     ------
@@ -304,21 +308,21 @@ def build(
     """
     cell, grid = cell or Cell(), grid or Grid()
     if mode == "paper":
-        return Model(mode, paper_table(cell, n_us=n_us, n_ss=n_ss, grid=grid))
+        return Model(mode, paper_table(cell, n_us=n_us, n_ss=n_ss, grid=grid, progress=progress))
     if mode == "radiometric":
-        return Model(mode, radiometric_table(cell, n_us=n_us, n_ss=n_ss, grid=grid))
+        return Model(mode, radiometric_table(cell, n_us=n_us, n_ss=n_ss, grid=grid, progress=progress))
     if mode == "interreflecting":
-        return _interreflecting(cell, n_us, n_ss, grid, seed)
+        return _interreflecting(cell, n_us, n_ss, grid, seed, progress)
     if mode == "body":
-        return _body(cell, lower, depth, n, grid, seed)
+        return _body(cell, lower, depth, n, grid, seed, progress)
     raise DomainError(f"no mode {mode!r}: expected one of {', '.join(MODES)}")
 
 
-def _interreflecting(cell: Cell, n_us: float, n_ss: float, grid: Grid, seed: int) -> Model:
+def _interreflecting(cell: Cell, n_us: float, n_ss: float, grid: Grid, seed: int, progress: Progress) -> Model:
     from fitting.orders import escape_orders
 
-    single = radiometric_table(cell, n_us=n_us, n_ss=n_ss, grid=grid)
-    traced = escape_orders(cell, *single.nodes, seed=seed)
+    single = radiometric_table(cell, n_us=n_us, n_ss=n_ss, grid=grid, progress=stage(progress, 0, 0.4))
+    traced = escape_orders(cell, *single.nodes, seed=seed, progress=stage(progress, 0.4, 1))
     count = len(traced.bases) - 1
     names = (*(f"order_{k + 1}" for k in range(count)), "order_rest", *TERMS[1:])
     others = [single.values[single.names.index(name)] for name in TERMS[1:]]
@@ -333,8 +337,8 @@ def _interreflecting(cell: Cell, n_us: float, n_ss: float, grid: Grid, seed: int
     return Model("interreflecting", table)
 
 
-def _body(cell: Cell, lower: Cell | None, depth: float, n: float, grid: Grid, seed: int) -> Model:
-    body = trace_body(Epidermis(cell, depth), Epidermis(lower, depth), n=n, seed=seed)
+def _body(cell: Cell, lower: Cell | None, depth: float, n: float, grid: Grid, seed: int, progress: Progress) -> Model:
+    body = trace_body(Epidermis(cell, depth), Epidermis(lower, depth), n=n, seed=seed, progress=stage(progress, 0, 0.9))
     theta, phi = grid.theta[:-1], grid.phi
     at = theta[:, None, None], theta[:, None], phi
     mirror = {"mirror": body.mirror_reflectance(*at), "mirror_below": body.turned_over().mirror_reflectance(*at)}

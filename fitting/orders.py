@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fitting.cells import Cell
 from fitting.errors import DomainError
+from fitting.progress import Progress, silent, stage
 from fitting.tracing import Domes, cast, on_all_cores
 
 if TYPE_CHECKING:
@@ -118,6 +119,7 @@ def escape_orders(
     rays: int = 4096,
     seed: int = 0,
     sampling: Sampling | None = None,
+    progress: Progress = silent,
 ) -> EscapeOrders:
     """Trace a cell once and return how light leaves it by the number of bounces.
 
@@ -138,6 +140,8 @@ def escape_orders(
         Of their places.
     sampling : Sampling, optional
         Of single bounce, as for `fitting.radiometric.radiometric_terms`.
+    progress : callable
+        Told the share done, 0 to 1.
 
     Raises
     ------
@@ -167,7 +171,7 @@ def escape_orders(
     beam_i, beam_r, beam = (facets.beam(angles) for angles in (theta_i, theta_r, inner))
     escape = 2 / facets.areas * np.einsum("g,gi->i", lambert, beam.mean(1))
     form, unclosed = _form_factors(cell, facets, escape, rays, seed)
-    first, (left, *others) = _single_bounce(cell, theta_i, theta_r, phi, sampling)
+    first, (left, *others) = _single_bounce(cell, theta_i, theta_r, phi, sampling, stage(progress, 0.3, 0.8))
 
     still = np.eye(len(form)) - form
 
@@ -211,7 +215,9 @@ def _hemisphere() -> tuple[Array, Array]:
     return np.degrees(np.arccos((x + 1) / 2)), w * (x + 1) / 4
 
 
-def _single_bounce(cell: Cell, theta_i: Array, theta_r: Array, phi: Array, sampling: Sampling | None) -> tuple[Array, list[Array]]:
+def _single_bounce(
+    cell: Cell, theta_i: Array, theta_r: Array, phi: Array, sampling: Sampling | None, progress: Progress
+) -> tuple[Array, list[Array]]:
     """Exact single bounce at the nodes (i, r, p), 1/sr, and what share of a beam it leaves, from `_hemisphere`, theta_i and theta_r."""
     from fitting.radiometric import radiometric_terms
 
@@ -221,7 +227,7 @@ def _single_bounce(cell: Cell, theta_i: Array, theta_r: Array, phi: Array, sampl
     grids = [np.meshgrid(*axes, indexing="ij") for axes in ((angles, inner, even), (theta_i, theta_r, phi))]
     # In one call, which then shares horizons.
     asked = (np.concatenate([some.ravel(), others.ravel()]) for some, others in zip(*grids, strict=True))
-    terms = np.split(radiometric_terms(*asked, cell=cell, sampling=sampling)[:, 0], [grids[0][0].size])
+    terms = np.split(radiometric_terms(*asked, cell=cell, sampling=sampling, progress=progress)[:, 0], [grids[0][0].size])
     all_round, first = (term.reshape(grid[0].shape) for term, grid in zip(terms, grids, strict=True))
     # A flat surface leaves nothing, or less than nothing by rounding.
     left = np.maximum(0.0, 1 - 2 * np.pi * np.trapezoid(all_round, even, axis=2) / 180 @ lambert)

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from fitting.cells import Cell
 from fitting.errors import DomainError
 from fitting.paper import LOBE_FLOOR, TERMS, flat_spongy
+from fitting.progress import Progress, silent
 
 if TYPE_CHECKING:
     from fitting.surface import Facets
@@ -87,6 +88,7 @@ def radiometric_terms(
     n_us: float = 40.0,
     n_ss: float = 5.0,
     sampling: Sampling | None = None,
+    progress: Progress = silent,
 ) -> Array:
     """Evaluate the single-bounce reflectance of tissues that are diffuse (1 / pi) or a lobe ((n + 2) / (2 pi) max(0, R.V)^n).
 
@@ -104,6 +106,8 @@ def radiometric_terms(
         Exponents of the lobes of the epidermis, domes and floor, and of the flat spongy tissue.
     sampling : Sampling, optional
         How finely.
+    progress : callable
+        Told the share done, 0 to 1.
 
     Returns
     -------
@@ -122,7 +126,7 @@ def radiometric_terms(
     cell = cell or Cell()
     _exponents(n_us=n_us, n_ss=n_ss)
     theta_i, theta_r, phi = _directions(theta_i_deg, theta_r_deg, phi_deg)
-    sums = _sums(cell, theta_i, theta_r, phi, n_us, sampling or Sampling(), foreshortened=True)
+    sums = _sums(cell, theta_i, theta_r, phi, n_us, sampling or Sampling(), progress, foreshortened=True)
     sums *= [1 / np.pi, (n_us + 2) / (2 * np.pi)] / (np.cos(theta_i) * np.cos(theta_r))[:, None]
     return np.column_stack([sums, flat_spongy_per_sr(_mirrored(theta_i, theta_r, phi), n_ss)])
 
@@ -136,12 +140,13 @@ def paper_terms_any(
     n_us: float = 40.0,
     n_ss: float = 5.0,
     sampling: Sampling | None = None,
+    progress: Progress = silent,
 ) -> Array:
     """Evaluate the four distributions r' of the paper, eqs. (1) to (7), for any directions and any cell.
 
     Parameters
     ----------
-    theta_i_deg, theta_r_deg, phi_deg, cell, n_us, sampling
+    theta_i_deg, theta_r_deg, phi_deg, cell, n_us, sampling, progress
         As in `radiometric_terms`.
     n_ss : float
         Exponent of the flat spongy tissue's lobe.
@@ -160,7 +165,7 @@ def paper_terms_any(
     cell = cell or Cell()
     _exponents(n_us=n_us, n_ss=n_ss)
     theta_i, theta_r, phi = _directions(theta_i_deg, theta_r_deg, phi_deg)
-    sums = _sums(cell, theta_i, theta_r, phi, n_us, sampling or Sampling(), foreshortened=False)
+    sums = _sums(cell, theta_i, theta_r, phi, n_us, sampling or Sampling(), progress, foreshortened=False)
     return np.column_stack([sums, flat_spongy(np.cos(theta_i), _mirrored(theta_i, theta_r, phi), n_ss)])
 
 
@@ -191,6 +196,7 @@ def basis_tables(
     n_us: float = 40.0,
     n_ss: float = 5.0,
     sampling: Sampling | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Array]:
     """Evaluate all bases at all combinations of nodes.
 
@@ -202,7 +208,7 @@ def basis_tables(
         Nodes, as in `radiometric_terms`.
     mode : str
         "radiometric" (1/sr) or "paper".
-    n_us, n_ss, sampling
+    n_us, n_ss, sampling, progress
         As in `paper_terms_any`.
 
     Returns
@@ -224,7 +230,7 @@ def basis_tables(
         evaluate = paper_terms_any
     else:
         raise DomainError(f"mode must be 'radiometric' or 'paper', not {mode!r}")
-    terms = evaluate(*directions, cell=cell, n_us=n_us, n_ss=n_ss, sampling=sampling)
+    terms = evaluate(*directions, cell=cell, n_us=n_us, n_ss=n_ss, sampling=sampling, progress=progress)
     return {name: np.ascontiguousarray(column.reshape(shape)) for name, column in zip(TERMS, terms.T, strict=True)}
 
 
@@ -298,7 +304,17 @@ def _facets(cell: Cell, points: int, turns: int, floor: bool) -> Facets:
     )
 
 
-def _sums(cell: Cell, theta_i: Array, theta_r: Array, phi_deg: Array, n_us: float, sampling: Sampling, *, foreshortened: bool) -> Array:
+def _sums(
+    cell: Cell,
+    theta_i: Array,
+    theta_r: Array,
+    phi_deg: Array,
+    n_us: float,
+    sampling: Sampling,
+    progress: Progress,
+    *,
+    foreshortened: bool,
+) -> Array:
     """Sums over facets for each direction, shape (n, 2), on all cores."""
     from fitting.surface import Facets, facet_sums, shape_of
 
@@ -326,6 +342,8 @@ def _sums(cell: Cell, theta_i: Array, theta_r: Array, phi_deg: Array, n_us: floa
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         tasks = [(rows, pool.submit(share, rows, slice(n, None, SHARES))) for rows in batches for n in range(SHARES)]
-        for rows, task in tasks:  # in order: the sums depend neither on which thread is quicker nor on how many there are
+        # In order: the sums depend neither on which thread is quicker nor on how many there are.
+        for done, (rows, task) in enumerate(tasks, 1):
             out[rows] += task.result()
+            progress(done / len(tasks))
     return out

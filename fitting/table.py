@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from fitting.cells import Cell
 from fitting.errors import DomainError, EnergyError
 from fitting.paper import TERMS, flat_spongy, paper_terms
+from fitting.progress import Progress, silent, stage
 from fitting.reflectance import INTENSITY, MODES, PER_SR, Reflectance
 
 if TYPE_CHECKING:
@@ -313,7 +314,13 @@ class ReflectanceTable:
 
 
 def paper_table(
-    cell: Cell | None = None, *, n_us: float = 40.0, n_ss: float = 5.0, grid: Grid | None = None, sampling: Sampling | None = None
+    cell: Cell | None = None,
+    *,
+    n_us: float = 40.0,
+    n_ss: float = 5.0,
+    grid: Grid | None = None,
+    sampling: Sampling | None = None,
+    progress: Progress = silent,
 ) -> ReflectanceTable:
     """Compute the paper's four distributions over all directions, on all cores.
 
@@ -326,7 +333,9 @@ def paper_table(
     grid : Grid, optional
         Where.
     sampling : fitting.radiometric.Sampling, optional
-        How finely the surface is integrated; by default as finely as the grid deserves.
+        How finely the surface is integrated; by default `Sampling.grazing()`.
+    progress : callable
+        Told the share done, 0 to 1.
 
     Returns
     -------
@@ -343,17 +352,23 @@ def paper_table(
     `tests/benchmarks/bench_form.py` prints how far tables are from direct integration for all directions;
     `ReflectanceTable.in_plane_error` measures one against `fitting.paper` in the plane of incidence.
     """
-    return _tabulated(cell or Cell(), "paper", n_us, n_ss, grid or Grid(), sampling)
+    return _tabulated(cell or Cell(), "paper", n_us, n_ss, grid or Grid(), sampling, progress)
 
 
 def radiometric_table(
-    cell: Cell | None = None, *, n_us: float = 40.0, n_ss: float = 5.0, grid: Grid | None = None, sampling: Sampling | None = None
+    cell: Cell | None = None,
+    *,
+    n_us: float = 40.0,
+    n_ss: float = 5.0,
+    grid: Grid | None = None,
+    sampling: Sampling | None = None,
+    progress: Progress = silent,
 ) -> ReflectanceTable:
     """Compute the single-bounce reflectance of `fitting.radiometric.radiometric_terms` over all directions, on all cores.
 
     Parameters
     ----------
-    cell, n_us, n_ss, grid, sampling
+    cell, n_us, n_ss, grid, sampling, progress
         As for `paper_table`.
 
     Returns
@@ -366,10 +381,12 @@ def radiometric_table(
     DomainError
         As `paper_table`.
     """
-    return _tabulated(cell or Cell(), "radiometric", n_us, n_ss, grid or Grid(), sampling)
+    return _tabulated(cell or Cell(), "radiometric", n_us, n_ss, grid or Grid(), sampling, progress)
 
 
-def _tabulated(cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, sampling: Sampling | None) -> ReflectanceTable:
+def _tabulated(
+    cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, sampling: Sampling | None, progress: Progress
+) -> ReflectanceTable:
     """Integrate at the nodes, and between some to see how far off the table is there."""
     from fitting.radiometric import LEANING, Sampling, basis_tables, radiometric_terms
 
@@ -377,11 +394,11 @@ def _tabulated(cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, samp
     fine = Sampling.grazing()
     rule = sampling or replace(fine, facets=max(fine.points(n_us), Sampling().points(n_us)))
 
-    def integrate(theta: Array, phi: Array) -> Mapping[str, Array]:
+    def integrate(theta: Array, phi: Array, progress: Progress) -> Mapping[str, Array]:
         if mode == "paper":
-            return basis_tables(cell, theta, theta, phi, mode, **exponents, sampling=rule)
+            return basis_tables(cell, theta, theta, phi, mode, **exponents, sampling=rule, progress=progress)
         i, r = np.triu_indices(len(theta))  # light and view may be swapped
-        half = radiometric_terms(theta[i][:, None], theta[r][:, None], phi, cell=cell, **exponents, sampling=rule)
+        half = radiometric_terms(theta[i][:, None], theta[r][:, None], phi, cell=cell, **exponents, sampling=rule, progress=progress)
         terms = np.empty((len(TERMS), len(theta), len(theta), len(phi)))
         terms[:, i, r] = terms[:, r, i] = half.reshape(len(i), len(phi), -1).transpose(2, 0, 1)
         return dict(zip(TERMS, terms, strict=True))
@@ -391,7 +408,7 @@ def _tabulated(cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, samp
     if n_us > 0 and apart > math.acos(0.5 ** (1 / n_us)):
         raise DomainError(f"u_spec, the lobe of n_us = {n_us:g}, falls between {points} facets: ask for finer sampling")
     theta = grid.theta[:-1]
-    bases = integrate(theta, grid.phi)
+    bases = integrate(theta, grid.phi, stage(progress, 0, 0.8))
     once = np.where((grid.phi == 0) | (grid.phi == 180), 0.5, 1.0)
     for values in bases.values():  # light or view from the zenith has no azimuth: what differs is how the points fall
         for zenith in (values[0], values[:, 0]):
@@ -411,7 +428,7 @@ def _tabulated(cell: Cell, mode: str, n_us: float, n_ss: float, grid: Grid, samp
         table = ReflectanceTable.from_basis(TERMS, bases, nodes=(theta, theta, grid.phi), mode=unit, provenance=provenance)
     except EnergyError as error:  # physics has none to give: a lobe between the nodes is drawn too wide
         raise DomainError(f"the grid is too coarse for what is reflected ({error}): ask for a finer grid") from error
-    off = _between(table, integrate)
+    off = _between(table, lambda theta, phi: integrate(theta, phi, stage(progress, 0.8, 1)))
     for name, exponent in (("u_spec", f"n_us = {n_us:g}"), ("s_spec", f"n_ss = {n_ss:g}")):
         if off[name] > LOBE_ERROR:
             raise DomainError(

@@ -28,6 +28,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fitting.cells import Cell
+from fitting.progress import Progress, silent
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
@@ -110,12 +111,16 @@ class Tally(NamedTuple):
         return Tally(*(part[k] for part in self))
 
 
-def on_all_cores(task: Callable[[int], Result], count: int) -> list[Result]:
-    """Results of task(0) to task(count - 1), in this order."""
+def on_all_cores(task: Callable[[int], Result], count: int, progress: Progress = silent) -> list[Result]:
+    """Results of task(0) to task(count - 1), in this order; `progress` is told the share done."""
     if count == 1:
         return [task(0)]
+    found: list[Result] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(task, range(count)))
+        for result in pool.map(task, range(count)):
+            found.append(result)
+            progress(len(found) / count)
+    return found
 
 
 @njit(cache=True, nogil=True, inline="always")

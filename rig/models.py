@@ -72,7 +72,7 @@ def used(mode: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     from fitting.model import build
     from fitting.table import Grid
 
-    known = {name: p.default for name, p in inspect.signature(build).parameters.items() if p.kind is p.KEYWORD_ONLY}
+    known = {name: p.default for name, p in inspect.signature(build).parameters.items() if p.kind is p.KEYWORD_ONLY and name != "progress"}
     if unknown := set(settings) - set(known):
         raise TypeError(f"no settings {sorted(unknown)} of a model: expected some of {sorted(known)}")
     needless = {"n_us", "n_ss"} if mode == "body" else {"lower", "depth", "n"} | (set() if mode == "interreflecting" else {"seed"})
@@ -81,17 +81,14 @@ def used(mode: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def built(mode: str, cell: "Cell", **settings: Any) -> "Model":
-    """Build a model, saying so on stderr."""
-    from rich.console import Console
-
+    """Build a model, with a bar on stderr."""
     from fitting.model import build
+    from rig.progress import steps
 
-    console = Console(stderr=True, highlight=False)
-    what = f"building the {mode} model, aspect {cell.aspect:g}: some seconds"
-    if not console.is_terminal:
-        print(what, file=sys.stderr)
-    with console.status(what):
-        return build(mode, cell, **used(mode, settings))
+    what = f"building the {mode} model, aspect {cell.aspect:g}"
+    print(what, file=sys.stderr)
+    with steps(what) as bar:
+        return build(mode, cell, **used(mode, settings), progress=lambda share: bar(round(100 * share), 100, ""))
 
 
 def store_model(model: "Model", path: Path) -> None:

@@ -85,6 +85,8 @@ def picture_rose(flower: Path, fits: dict[str, StoredFit], workspace: Workspace)
     from rig.pictures import frame, marked, marks_of, shade_of, show, take
 
     folder, marks = workspace.figures, marks_of(flower, *fits.values())
+    for fit in (fits["RR"], refitted(fits["RR"], ROSE_ASPECT)):  # models first: one bar at a time
+        shade_of(fit, workspace)
     with steps("ray-casting") as progress:
         progress(0, 2, "figures 11, 13, 14")
         _, contrasts = draw_flower(flower, fits, folder, marks=marks, workspace=workspace)

@@ -192,6 +192,16 @@ def test_too_much_light_is_refused(built: Built) -> None:
         built("body").reflectance(mu=0.0, R_m=0.7, T_m=0.6)
 
 
+@pytest.mark.parametrize(("mode", "cell"), [("paper", Cell(1.0)), ("interreflecting", Cell(1.0)), ("body", Cell(1.0))])
+def test_the_share_done_rises_to_all_of_it(mode: str, cell: Cell) -> None:
+    told: list[float] = []
+    build(mode, cell, n_us=5.0, grid=Grid(6, 36), progress=told.append)
+    assert told == sorted(told)
+    assert 0 < told[0] < 0.2
+    assert told[-1] >= 0.8
+    assert len(told) > 10
+
+
 def test_only_known_modes_and_cells_are_built() -> None:
     with pytest.raises(DomainError, match="expected one of"):
         build("phong")
