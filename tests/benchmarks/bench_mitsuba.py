@@ -120,7 +120,7 @@ class Traced:
 def main() -> int:
     """Print the figures; return how many targets were missed."""
     if importlib.util.find_spec("mitsuba") is None:
-        print("   Mitsuba 3 is not installed: nothing to compare with (pip install mitsuba)")
+        print("   Mitsuba 3 is not installed: nothing to compare with (pip install 'petal-rig[photoreal]')")
         return 0
     from tests.fitting.mitsuba_patch import vectorised
 

@@ -1,0 +1,742 @@
+"""The linear fit: coefficients that are never negative, how far each can be trusted, and what the readings cannot tell.
+
+Intervals are profiled: those values of a coefficient at which the weighted sum of squares, minimised over all other coefficients from 0 up,
+exceeds its least by no more than the 95 % point. Away from 0 that is plus or minus 1.96 standard errors; at 0 it becomes one-sided, and
+then holds the truth at least as often as it says, since a truth at the bound can be missed only from above.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fitting.errors import FitError, ReadingError
+from fitting.paper import TERMS, paper_terms
+
+Weights = Literal["relative", "plain", "sigma", "covariance"]
+Array = NDArray[np.float64]
+MaskedArray = np.ma.MaskedArray[Any, np.dtype[np.float64]]
+
+RANK_TOLERANCE = 1e-3
+"""Singular values below this fraction of the largest count as zero: the terms themselves are no better known."""
+
+NEGLIGIBLE = 1e-6
+"""A term that stays below this fraction of the largest at every reading is taken as absent: its coefficient would be noise, blown up."""
+
+MOVED = 0.01
+"""A coefficient counts as not determined when the directions the data cannot see hold this share of it (0.1 squared)."""
+
+ALIKE = 0.95
+"""From this correlation on, two coefficients are said to be hard to tell apart."""
+
+CONFIDENCE = 0.95
+
+NOISE = 5.0
+"""A reading may lie this many standard deviations below 0 before it is an error and not noise."""
+
+ROUNDING = 1e-10
+"""Curvatures and slopes of columns of unit length below this are zero."""
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One coefficient of a linear fit.
+
+    Attributes
+    ----------
+    name : str
+        Of its term.
+    value : float
+        0 or more, in the unit of values / terms.
+    standard_error : float
+        Of the estimate were it free to be negative; infinite where not determined or where nothing tells the noise.
+    low, high : float
+        95 % interval, profiled with all coefficients 0 or more; `low` is 0 where the data do not exclude 0, `high` may be infinite.
+    active : bool
+        Whether the value is 0 because the constraint holds it there.
+    multiplier : float
+        Of an active constraint: growth of the weighted sum of squares for each unit of the coefficient; else 0.
+    determined : bool
+        Whether the readings fix it; if not, the value is one of many that fit equally well, all within the interval.
+    """
+
+    name: str
+    value: float
+    standard_error: float
+    low: float
+    high: float
+    active: bool
+    multiplier: float
+    determined: bool
+
+    def __str__(self) -> str:
+        if not self.determined:
+            return f"{self.name}: not determined, {self.low:.4g} to {self.high:.4g}"
+        held = f", held at 0 (multiplier {self.multiplier:.3g})" if self.active else ""
+        return f"{self.name} = {self.value:.4g} +- {self.standard_error:.2g}, 95 %: {self.low:.4g} to {self.high:.4g}{held}"
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Outcome of `fit_linear`.
+
+    Attributes
+    ----------
+    coefficients : tuple of Coefficient
+        In the order of the columns.
+    weights : str
+        "relative", "plain", "sigma" or "covariance".
+    measured, modelled : ndarray, shape (n,)
+        Values given and fitted.
+    E : masked ndarray, shape (n,), percent
+        Eq. (13), abs(measured - modelled) / measured; masked at readings of 0 or less, where it means nothing.
+    cosine_rmse : float or None
+        Root of the mean of (measured - modelled)^2 weighted by abs(cos(theta_r)), in the unit of the values; None without theta_r.
+    sum_of_squares : float
+        What was minimised.
+    chi2 : float or None
+        Residuals against their covariance, whatever the weights; None if there is none.
+    dof : int
+        Readings less coefficients above 0.
+    scale : float or None
+        Standard deviation of the weighted residuals (of relative weights: a fraction); None without degrees of freedom.
+    known_noise : bool
+        Whether standard errors come from a covariance that was given, or else from `scale`.
+    rank : int
+        Combinations of coefficients that the readings fix.
+    condition : float
+        Ratio of largest to smallest singular value of the weighted design, columns scaled to length 1; infinite if a term is absent.
+    groups : tuple of tuple of str
+        Coefficients that trade against one another without changing the fit, a group for each independent direction or several; a term
+        absent from all readings is a group of its own.
+    correlation : ndarray, shape (c, c)
+        Of the coefficients were they free to be negative; within a group, of the direction the data cannot see.
+    """
+
+    coefficients: tuple[Coefficient, ...]
+    weights: str
+    measured: Array
+    modelled: Array
+    E: MaskedArray
+    cosine_rmse: float | None
+    sum_of_squares: float
+    chi2: float | None
+    dof: int
+    scale: float | None
+    known_noise: bool
+    rank: int
+    condition: float
+    groups: tuple[tuple[str, ...], ...]
+    correlation: Array
+
+    def __len__(self) -> int:
+        return self.measured.size
+
+    def __getitem__(self, name: str) -> Coefficient:
+        for coefficient in self.coefficients:
+            if coefficient.name == name:
+                return coefficient
+        raise KeyError(name)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
+        return tuple(c.name for c in self.coefficients)
+
+    @property
+    def x(self) -> Array:
+        """Values of the coefficients, shape (c,)."""
+        return np.array([c.value for c in self.coefficients])
+
+    @property
+    def E_mean(self) -> float | None:
+        """Mean of E over the readings above 0, percent; None if there are none."""
+        return float(self.E.mean()) if self.E.count() else None
+
+    @property
+    def E_max(self) -> float | None:
+        """Largest E among the readings above 0, percent; None if there are none."""
+        return float(self.E.max()) if self.E.count() else None
+
+    @property
+    def chi2_per_dof(self) -> float | None:
+        """Chi-square per degree of freedom; None without a covariance or without degrees of freedom."""
+        return None if self.chi2 is None or self.dof == 0 else self.chi2 / self.dof
+
+    @property
+    def active(self) -> tuple[str, ...]:
+        """Coefficients that a constraint holds at 0."""
+        return tuple(c.name for c in self.coefficients if c.active)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Coefficients that the readings do not fix."""
+        return tuple(c.name for c in self.coefficients if not c.determined)
+
+    @property
+    def alike(self) -> tuple[tuple[str, str, float], ...]:
+        """Pairs that are hard to tell apart or cannot be, with their correlation."""
+        pairs = combinations(range(len(self.coefficients)), 2)
+        return tuple((self.names[i], self.names[j], float(r)) for i, j in pairs if abs(r := self.correlation[i, j]) >= ALIKE)
+
+    @property
+    def statement(self) -> str:
+        """What can and what cannot be concluded, line by line."""
+        lines = [str(c) for c in self.coefficients]
+        lines.append(f"{len(self)} readings fix {self.rank} of {len(self.coefficients)} coefficients (condition {self.condition:.3g})")
+        for group in self.groups:
+            if len(group) == 1:
+                lines.append(f"{group[0]} is NOT determined: its term is next to nothing at every reading")
+            else:
+                named = f"{', '.join(group[:-1])} and {group[-1]}"
+                lines.append(f"{named} are NOT determined: they can change together without changing the fit; add readings at other angles")
+        apart = [(a, b, r) for a, b, r in self.alike if self[a].determined and self[b].determined]
+        lines += [f"{a} and {b} are hard to tell apart: correlation {r:.3f}" for a, b, r in apart]
+        if self.chi2_per_dof is not None:
+            lines.append(f"chi-square per degree of freedom {self.chi2_per_dof:.3g} ({self.dof})")
+            if self.chi2_per_dof > 1 + 3 * math.sqrt(2 / self.dof):
+                lines.append("the model does not describe the readings within their uncertainty: the intervals leave that misfit out")
+        elif self.scale is None:
+            lines.append("no standard errors: as many coefficients as readings, and no covariance that tells the noise")
+        return "\n".join(lines)
+
+    def reflectances(self, unit: ArrayLike, white: float = 1.0) -> dict[str, tuple[float, float, float]]:
+        """Normalise the coefficients to reflectances.
+
+        Parameters
+        ----------
+        unit : array_like, shape (c,)
+            Reflectance of each term with coefficient 1, such as `unit_reflectances` gives for the paper's.
+        white : float
+            Reading of the perfect diffuser at normal incidence in the unit of the values; 1 for reflectance factors and for BRDF, as
+            `Measurements.intensity` converts them.
+
+        Returns
+        -------
+        dict of str to (float, float, float)
+            Reflectance and its 95 % interval.
+
+        Raises
+        ------
+        FitError
+            If the white reading is not above 0, or there is not one unit for each coefficient.
+        """
+        per = np.asarray(unit, float)
+        if not (math.isfinite(white) and white > 0):
+            raise FitError(f"the white reading must be a finite number above 0, not {white!r}")
+        if per.shape != (len(self.coefficients),) or not np.all(np.isfinite(per) & (per > 0)):
+            raise FitError(f"expected {len(self.coefficients)} unit reflectances above 0, one for each coefficient, not {unit!r}")
+        return {
+            c.name: (c.value * u / white, c.low * u / white, c.high * u / white)
+            for c, u in zip(self.coefficients, per.tolist(), strict=True)
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain numbers, text and lists that JSON can hold; what is infinite or means nothing becomes None."""
+        return {
+            "coefficients": [{k: _plain(v) for k, v in asdict(c).items()} for c in self.coefficients],
+            "x": {c.name: c.value for c in self.coefficients},
+            "weights": self.weights,
+            "measured": self.measured.tolist(),
+            "modelled": self.modelled.tolist(),
+            "E": self.E.tolist(),
+            "E_mean": self.E_mean,
+            "E_max": self.E_max,
+            "cosine_rmse": self.cosine_rmse,
+            "sum_of_squares": self.sum_of_squares,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "chi2_per_dof": self.chi2_per_dof,
+            "scale": self.scale,
+            "known_noise": self.known_noise,
+            "rank": self.rank,
+            "condition": _plain(self.condition),
+            "groups": [list(group) for group in self.groups],
+            "active": list(self.active),
+            "undetermined": list(self.undetermined),
+            "alike": [list(pair) for pair in self.alike],
+            "correlation": self.correlation.tolist(),
+            "statement": self.statement,
+        }
+
+
+def fit_linear(
+    terms: ArrayLike,
+    values: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    weights: Weights = "relative",
+    names: Sequence[str] = TERMS,
+    theta_r_deg: ArrayLike | None = None,
+    source: str = "readings",
+    rows: ArrayLike | None = None,
+) -> LinearFit:
+    """Fit values = terms @ x with no x below 0.
+
+    Parameters
+    ----------
+    terms : array_like, shape (n, c)
+        What each reading would be for each coefficient alone at 1.
+    values : array_like, shape (n,)
+        Readings.
+    covariance : array_like, shape (n, n), optional
+        Of the readings. Standard errors and intervals follow from it under any weights; without it, from the residuals, by Student's t.
+    weights : {"relative", "plain", "sigma", "covariance"}
+        Minimise the residuals over the readings, as they are, over the covariance's diagonal, or over all of it. Relative weights favour
+        readings that happen to be low: with noise of a fraction f the coefficients come out low by about f^2.
+    names : sequence of str
+        Of the columns.
+    theta_r_deg : array_like, shape (n,), optional, deg
+        Views, for the cosine-weighted error.
+    source : str
+        Where the readings come from, for errors.
+    rows : array_like of int, shape (n,), optional
+        Row of each in its source; 1, 2, ... if not given.
+
+    Returns
+    -------
+    LinearFit
+        Also for too few or collinear readings: what they fix is found, and what not is said.
+
+    Raises
+    ------
+    ReadingError
+        Naming the row: a value or term is not finite; a reading is not above 0 with relative weights, or further below 0 than noise goes;
+        a variance is not above 0; the covariance is not positive definite from this row on.
+    FitError
+        If the shapes do not match, there are no readings, no term acts on any of them, or there is no covariance to weigh by.
+    """
+    design, target, views, lines, names = _checked(terms, values, theta_r_deg, source, rows, names)
+    noise = None if covariance is None else _checked_covariance(covariance, len(target), source, lines)
+    root = None if noise is None else _cholesky(noise, source, lines)
+    _require_light(target, noise, weights, source, lines)
+    size = np.abs(design).max(axis=0)
+    present = size > NEGLIGIBLE * size.max()
+    if not present.any():
+        raise FitError(
+            f"{source}: every term is 0 at every reading, so no coefficient can be found: choose readings where the model is not 0"
+        )
+
+    whiten = _whitener(weights, target, noise, root, source)
+    weighted, aim = whiten(design[:, present]), whiten(target[:, None])[:, 0]
+    length = np.linalg.norm(weighted, axis=0)
+    u, singular, v = _seen(weighted / length)
+    x, gradient = _non_negative(singular[:, None] * v, u.T @ aim, source)
+    modelled = design[:, present] @ (x / length)
+    sum_of_squares = float(np.sum((whiten((target - modelled)[:, None])) ** 2))
+
+    dof = len(target) - int(np.sum(x > 0))
+    scale = math.sqrt(sum_of_squares / dof) if dof > 0 else None
+    spread = _spread(u, weights, whiten, noise)
+    level = 1.0 if noise is not None else math.inf if scale is None else scale
+    quantile = _quantile(None if noise is not None else dof)
+    moved, hidden = _hidden(u.shape[1], v)
+    inverse = v.T / singular
+    curvature, variance = np.sum(inverse**2, axis=1), inverse @ spread @ inverse.T
+    # The sum of squares may rise by this before x is excluded; where x is hidden, by the most that any direction's noise asks for.
+    rise = np.where(moved, np.linalg.eigvalsh(spread)[-1], np.diag(variance) / curvature) * (quantile * level) ** 2
+    normal = (v.T * singular**2) @ v
+    slope = np.where(x > 0, 0.0, gradient)
+    ends = [_interval(normal, slope, x, j, float(rise[j])) if math.isfinite(rise[j]) else (0.0, math.inf) for j in range(len(x))]
+    deviation = np.where(moved, math.inf, level * np.sqrt(np.diag(variance)))
+
+    found = iter(zip(x / length, deviation / length, ends, length, slope, moved, strict=True))
+    coefficients = []
+    for name, here in zip(names, present, strict=True):
+        if not here:
+            coefficients.append(Coefficient(name, 0.0, math.inf, 0.0, math.inf, active=False, multiplier=0.0, determined=False))
+            continue
+        value, error, (low, high), one, push, unseen = next(found)
+        held = bool(value == 0)
+        multiplier = 2 * max(0.0, float(push * one)) if held else 0.0
+        coefficients.append(
+            Coefficient(name, float(value), float(error), float(low / one), float(high / one), held, multiplier, not bool(unseen))
+        )
+    smallest = np.linalg.svd(weighted / length, compute_uv=False)
+    full = bool(present.all()) and len(smallest) == len(names) and smallest[-1] > 0
+    percent = np.ma.masked_where(target <= 0, 100 * np.abs(target - modelled) / np.where(target > 0, target, 1.0))
+    return LinearFit(
+        coefficients=tuple(coefficients),
+        weights=weights,
+        measured=target,
+        modelled=modelled,
+        E=percent,
+        cosine_rmse=_cosine_rmse(target - modelled, views),
+        sum_of_squares=sum_of_squares,
+        chi2=None if root is None else float(np.sum(_solve_root(root, (target - modelled)[:, None]) ** 2)),
+        dof=dof,
+        scale=scale,
+        known_noise=noise is not None,
+        rank=len(singular),
+        condition=float(smallest[0] / smallest[-1]) if full else math.inf,
+        groups=_groups(names, present, moved, hidden),
+        correlation=_correlation(present, moved, variance, hidden),
+    )
+
+
+def unit_reflectances(*, aspect: float, n_us: float = 40.0, n_ss: float = 5.0, nodes: int = 32) -> Array:
+    """Reflectance of each of the paper's terms with coefficient 1, at normal incidence into the hemisphere.
+
+    Readings on the scale of `Measurements.intensity` are pi f_r cos(theta_i), so the reflectance is the integral of r'(0, theta) over
+    sin^2(theta): 1 for s_diff, 2 / (n_ss + 2) for s_spec.
+
+    Parameters
+    ----------
+    aspect, n_us, n_ss : float
+        Of the cells and lobes, as in `paper_terms`.
+    nodes : int
+        Gauss-Legendre nodes over sin^2(theta).
+
+    Returns
+    -------
+    ndarray, shape (4,), 1/1
+
+    Raises
+    ------
+    DomainError
+        If the cell shape or an exponent is outside the model.
+    """
+    z, w = np.polynomial.legendre.leggauss(nodes)
+    terms = paper_terms(0.0, np.degrees(np.arcsin(np.sqrt((z + 1) / 2))), aspect=aspect, n_us=n_us, n_ss=n_ss)
+    return w / 2 @ terms
+
+
+Range = tuple[float, float]
+
+
+def mixture_from(
+    x: Mapping[str, float | Range],
+    *,
+    t_u: float | None = None,
+    t_s: float | None = None,
+    k_u_diff: float | None = None,
+    k_u_spec: float | None = None,
+    k_s_diff: float | None = None,
+    k_s_spec: float | None = None,
+    k_max: float = math.inf,
+) -> dict[str, Range]:
+    """Solve eqs. (9) to (12) for transmittances and reflectances, as far as they can be.
+
+    Four equations hold six unknowns: with t_u and t_s known all k follow, with one k of each layer t_u and t_s do too; anything less leaves
+    ranges. Each range is the exact extent of what is possible, the others being free within theirs.
+
+    Parameters
+    ----------
+    x : mapping of str to float or (float, float)
+        Coefficients u_diff, u_spec, s_diff, s_spec, or intervals for them.
+    t_u, t_s : float, optional
+        Transmittance of epidermis and spongy tissue, 0 to 1.
+    k_u_diff, k_u_spec, k_s_diff, k_s_spec : float, optional
+        Magnitudes of their reflectances, in the unit of x, 0 to `k_max`.
+    k_max : float
+        Largest k possible, such as 1 where x are reflectances.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        Lowest and highest t_u, t_s, k_u_diff, k_u_spec, k_s_diff, k_s_spec; equal where determined, infinite where unbounded.
+
+    Raises
+    ------
+    FitError
+        If a number is out of its range, or what is given contradicts itself.
+    """
+    if missing := [name for name in TERMS if name not in x]:
+        raise FitError(f"x lacks {', '.join(missing)}")
+    if not k_max > 0:
+        raise FitError(f"k_max must be above 0, not {k_max!r}")
+    amounts = {name: _range(f"x_{name}", x[name], math.inf) for name in TERMS}
+    given = {"u_diff": k_u_diff, "u_spec": k_u_spec, "s_diff": k_s_diff, "s_spec": k_s_spec}
+    k = {name: (0.0, k_max) if value is None else _range(f"k_{name}", value, k_max) for name, value in given.items()}
+    through_u = (0.0, 1.0) if t_u is None else _range("t_u", t_u, 1.0)
+    through_s = (0.0, 1.0) if t_s is None else _range("t_s", t_s, 1.0)
+
+    # What reaches the eye of each layer: x_u = seen_u k_u with seen_u = 1 - t_u, x_s = seen_s k_s with seen_s = t_u (1 - t_s).
+    seen_u, seen_s = (1 - through_u[1], 1 - through_u[0]), (0.0, through_u[1] * (1 - through_s[0]))
+    for name in TERMS:
+        share = _over(amounts[name], k[name])
+        if name.startswith("u"):
+            seen_u = _both(seen_u, share, f"x_{name} = (1 - t_u) k_{name}")
+        else:
+            seen_s = _both(seen_s, share, f"x_{name} = t_u (1 - t_s) k_{name}")
+    kept_s = (1 - through_s[1], 1 - through_s[0])
+    through_u = _both((1 - seen_u[1], 1 - seen_u[0]), _over(seen_s, kept_s), "t_u of both layers")
+    seen_u = (1 - through_u[1], 1 - through_u[0])
+    seen_s = _both(seen_s, (through_u[0] * kept_s[0], through_u[1] * kept_s[1]), "t_u (1 - t_s)")
+    kept_s = _both(kept_s, _over(seen_s, through_u), "1 - t_s")
+    out = {"t_u": through_u, "t_s": (1 - kept_s[1], 1 - kept_s[0])}
+    for name in TERMS:
+        out[f"k_{name}"] = _both(k[name], _over(amounts[name], seen_u if name.startswith("u") else seen_s), f"k_{name}")
+    return out
+
+
+def _range(name: str, value: float | Range, most: float) -> Range:
+    low, high = value if isinstance(value, tuple) else (value, value)
+    if not 0 <= low <= high <= most:
+        raise FitError(f"{name} must lie within 0 to {most:g}, not {value!r}")
+    return float(low), float(high)
+
+
+def _over(numerator: Range, denominator: Range) -> Range:
+    """Range of q >= 0 for which q d = n has a solution within the ranges; inf for no bound."""
+    low = 0.0 if numerator[0] == 0 else numerator[0] / denominator[1] if denominator[1] > 0 else math.inf
+    high = math.inf if denominator[0] == 0 or numerator[1] == math.inf else numerator[1] / denominator[0]
+    return low, high
+
+
+def _both(one: Range, other: Range, what: str) -> Range:
+    """Intersect two ranges; ends that miss one another by rounding meet."""
+    low, high = max(one[0], other[0]), min(one[1], other[1])
+    if low > high or low == math.inf:
+        if low == math.inf or low - high > 1e-9 * max(1.0, low):
+            raise FitError(f"what is given contradicts itself: {what} would have to be at least {low:.6g} and at most {high:.6g}")
+        low = high = (low + high) / 2
+    return low, high
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _checked(
+    terms: ArrayLike, values: ArrayLike, theta_r_deg: ArrayLike | None, source: str, rows: ArrayLike | None, names: Sequence[str]
+) -> tuple[Array, Array, Array | None, NDArray[np.int64], tuple[str, ...]]:
+    """Return design, readings, views, rows and names as they should be."""
+    try:
+        design, target = np.array(terms, float), np.array(values, float)
+        views = None if theta_r_deg is None else np.array(theta_r_deg, float)
+        lines = np.arange(1, target.size + 1) if rows is None else np.array(rows, dtype=np.int64)
+    except (TypeError, ValueError) as error:
+        raise FitError(f"{source}: terms, values, views and rows must be numbers: {error}") from error
+    if target.ndim != 1 or target.size == 0:
+        raise FitError(f"{source}: expected one or more readings in one column, not shape {target.shape}")
+    if design.shape != (target.size, len(names)) or not names:
+        raise FitError(
+            f"{source}: terms have shape {design.shape}, expected ({target.size}, {len(names)}): a row a reading, a column a name"
+        )
+    if len(set(names)) < len(names):
+        raise FitError(f"{source}: two columns have the same name among {', '.join(names)}")
+    for what, column in (("theta_r", views), ("rows", lines)):
+        if column is not None and column.shape != target.shape:
+            raise FitError(f"{source}: {what} has shape {column.shape}, expected {target.shape}")
+    for what, column in (("the reading", target), ("a term", design.sum(axis=1)), ("theta_r", views)):
+        if column is not None and not np.all(good := np.isfinite(column)):
+            first = int(np.flatnonzero(~good)[0])
+            raise ReadingError(source, int(lines[first]), f"{what} is not a finite number: leave the row out or mend it")
+    target.flags.writeable = False
+    return design, target, views, lines, tuple(names)
+
+
+def _checked_covariance(covariance: ArrayLike, n: int, source: str, rows: NDArray[np.int64]) -> Array:
+    try:
+        noise = np.array(covariance, float)
+    except (TypeError, ValueError) as error:
+        raise FitError(f"{source}: the covariance must be numbers: {error}") from error
+    if noise.shape != (n, n):
+        raise FitError(f"{source}: the covariance has shape {noise.shape}, expected ({n}, {n}) for {n} readings")
+    variance = np.diag(noise)
+    if np.any(bad := ~(np.isfinite(variance) & (variance > 0))):
+        first = int(np.flatnonzero(bad)[0])
+        raise ReadingError(source, int(rows[first]), f"its variance is {variance[first]:g}, expected a finite number above 0")
+    allowed = 1e-9 * np.sqrt(variance[:, None] * variance)
+    if not np.all(good := np.abs(noise - noise.T) <= allowed):  # also False for NaN
+        first, second = (int(i) for i in np.argwhere(~good)[0])
+        raise ReadingError(source, int(rows[first]), f"its covariance with row {rows[second]} is not finite or not symmetric")
+    return (noise + noise.T) / 2
+
+
+def _cholesky(noise: Array, source: str, rows: NDArray[np.int64]) -> Array:
+    """Lower root of the covariance, or an error that names the first row others leave no variance."""
+    from scipy.linalg.lapack import dpotrf
+
+    deviation = np.sqrt(np.diag(noise))
+    root, stopped = dpotrf(noise / deviation[:, None] / deviation, lower=1, clean=1)
+    own = np.diag(root)[: stopped - 1] if stopped else np.diag(root)
+    if np.any(exhausted := own < 1e-7):  # of 1: what is left of the standard deviation is rounding
+        stopped = int(np.flatnonzero(exhausted)[0]) + 1
+    if stopped:
+        raise ReadingError(
+            source,
+            int(rows[stopped - 1]),
+            "the covariance is not positive definite: the rows before would foretell this one exactly; give it noise of its own or drop it",
+        )
+    return np.asarray(root) * deviation[:, None]
+
+
+def _solve_root(root: Array, columns: Array) -> Array:
+    from scipy.linalg import solve_triangular
+
+    return np.asarray(solve_triangular(root, columns, lower=True, check_finite=False))
+
+
+def _require_light(target: Array, noise: Array | None, weights: str, source: str, rows: NDArray[np.int64]) -> None:
+    """Refuse readings that cannot be light, or cannot be divided by."""
+    if weights == "relative" and np.any(dark := target <= 0):
+        first = int(np.flatnonzero(dark)[0])
+        problem = f"reading is {target[first]:g}, but relative weights need it above 0: leave it out or use other weights"
+        raise ReadingError(source, int(rows[first]), problem)
+    if noise is not None and np.any(negative := target < -NOISE * np.sqrt(np.diag(noise))):
+        first = int(np.flatnonzero(negative)[0])
+        times = -target[first] / math.sqrt(noise[first, first])
+        problem = f"reading is {target[first]:g}, {times:.3g} standard deviations below 0, which no light can be: look at the dark reading"
+        raise ReadingError(source, int(rows[first]), problem)
+
+
+class _Scaled:
+    """Multiplies the rows of a matrix."""
+
+    def __init__(self, factor: Array) -> None:
+        self.factor = factor[:, None]
+
+    def __call__(self, columns: Array) -> Array:
+        return columns * self.factor
+
+
+class _Rooted:
+    """Applies the inverse of the covariance's root."""
+
+    def __init__(self, root: Array) -> None:
+        self.root = root
+
+    def __call__(self, columns: Array) -> Array:
+        return _solve_root(self.root, columns)
+
+
+def _whitener(weights: str, target: Array, noise: Array | None, root: Array | None, source: str) -> _Scaled | _Rooted:
+    if weights == "plain":
+        return _Scaled(np.ones(len(target)))
+    if weights == "relative":
+        return _Scaled(1 / target)
+    if weights not in ("sigma", "covariance"):
+        raise FitError(f"unknown weights {weights!r}; known are relative, plain, sigma and covariance")
+    if noise is None or root is None:
+        raise FitError(f"{source}: there is no covariance to weigh by: give one or use other weights")
+    return _Rooted(root) if weights == "covariance" else _Scaled(1 / np.sqrt(np.diag(noise)))
+
+
+def _seen(design: Array) -> tuple[Array, Array, Array]:
+    """Singular values and directions of the design that count."""
+    u, singular, v = np.linalg.svd(design, full_matrices=False)
+    counts = singular >= RANK_TOLERANCE * singular[0]
+    return u[:, counts], singular[counts], v[counts]
+
+
+def _non_negative(design: Array, target: Array, source: str) -> tuple[Array, Array]:
+    """Least squares from 0 up, and half the gradient there."""
+    from scipy.optimize import nnls
+
+    try:
+        x, _ = nnls(design, target)
+    except RuntimeError as error:
+        raise FitError(f"{source}: non-negative least squares did not converge: {error}") from error
+    return x, design.T @ (design @ x - target)
+
+
+def _spread(u: Array, weights: str, whiten: _Scaled | _Rooted, noise: Array | None) -> Array:
+    """Covariance of the weighted readings along the directions that count; without a covariance of theirs, up to a factor."""
+    if noise is None or weights == "covariance":
+        return np.eye(u.shape[1])
+    back = whiten(u)  # the whitener is diagonal here
+    return back.T @ noise @ back
+
+
+def _quantile(dof: int | None) -> float:
+    """Two-sided point of the normal distribution, or of Student's where the noise was estimated."""
+    from scipy.special import ndtri, stdtrit
+
+    tail = (1 + CONFIDENCE) / 2
+    return float(ndtri(tail) if dof is None else stdtrit(max(dof, 1), tail))
+
+
+def _hidden(rank: int, v: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Coefficients that the unseen directions move, and the projector onto those directions."""
+    hidden = np.eye(v.shape[1]) - v.T @ v if rank < v.shape[1] else np.zeros((v.shape[1], v.shape[1]))
+    return np.diag(hidden) > MOVED, hidden
+
+
+def _interval(normal: Array, slope: Array, x: Array, j: int, rise: float) -> Range:
+    return _end(normal, slope, x, j, -1.0, rise) if x[j] > 0 else 0.0, _end(normal, slope, x, j, 1.0, rise)
+
+
+def _end(normal: Array, slope: Array, x: Array, j: int, way: float, rise: float) -> float:
+    """Follow the least sum of squares as x[j] moves away from the best fit, until it has risen by `rise` or x[j] is 0.
+
+    It is a parabola between places where another coefficient reaches 0 or leaves it. `normal` is the normal matrix of columns of unit
+    length and `slope` half the gradient at `x`.
+    """
+    x, slope, free = x.copy(), slope.copy(), x > 0
+    free[j] = False
+    size = math.sqrt(float(x @ normal @ x)) + math.sqrt(rise)
+    for _ in range(20 * len(x) + 20):
+        step = np.zeros(len(x))
+        step[j] = way
+        if free.any():
+            step[free] = _solve(normal[np.ix_(free, free)], -way * normal[free, j])
+        turn = normal @ step
+        bend, climb = way * turn[j], max(0.0, way * slope[j])
+        flat = bend < ROUNDING and climb <= ROUNDING * size
+        reach = math.inf if flat else max(0.0, rise) / (climb + math.sqrt(climb**2 + max(bend, 0.0) * max(0.0, rise)) or math.inf)
+        if way < 0:
+            reach = min(reach, x[j])
+        bound = np.full(len(x), math.inf)
+        falling, freed = free & (step < -ROUNDING), ~free & (turn < -ROUNDING)
+        freed[j] = False
+        bound[falling] = x[falling] / -step[falling]
+        bound[freed] = np.maximum(0.0, slope[freed]) / -turn[freed]
+        i = int(np.argmin(bound))
+        if reach <= bound[i]:
+            return max(0.0, float(x[j] + way * reach))
+        x = x + bound[i] * step
+        slope = slope + bound[i] * turn
+        rise -= bound[i] * (2 * climb + bound[i] * bend)
+        free[i] = not free[i]
+        x[i] = max(0.0, x[i]) if free[i] else 0.0
+        slope[free] = 0.0
+    raise FitError("the interval of a coefficient was not found: its profile has more pieces than it should")
+
+
+def _solve(normal: Array, aim: Array) -> Array:
+    """Solve the normal equations; where they are singular, for the shortest solution."""
+    values, vectors = np.linalg.eigh(normal)
+    seen = values > ROUNDING * values[-1]
+    vectors = vectors[:, seen]
+    return vectors @ ((vectors.T @ aim) / values[seen])
+
+
+def _groups(names: tuple[str, ...], present: NDArray[np.bool_], moved: NDArray[np.bool_], hidden: Array) -> tuple[tuple[str, ...], ...]:
+    """Split coefficients that are not determined into those that move together."""
+    here = np.flatnonzero(present)
+    linked = np.abs(hidden) > MOVED
+    left = [int(i) for i in np.flatnonzero(moved)]
+    groups = []
+    while left:
+        group = {left[0]}
+        while more := {k for k in left if k not in group and any(linked[i, k] for i in group)}:
+            group |= more
+        groups.append(tuple(names[here[i]] for i in sorted(group)))
+        left = [i for i in left if i not in group]
+    return (*groups, *((name,) for name, there in zip(names, present, strict=True) if not there))
+
+
+def _correlation(present: NDArray[np.bool_], moved: NDArray[np.bool_], variance: Array, hidden: Array) -> Array:
+    out = np.eye(len(present))
+    here = np.flatnonzero(present)
+    for chosen, matrix in ((~moved, variance), (moved, hidden)):
+        part = matrix[np.ix_(chosen, chosen)]
+        if part.size and np.all(np.isfinite(part)) and np.all(np.diag(part) > 0):
+            deviation = np.sqrt(np.diag(part))
+            out[np.ix_(here[chosen], here[chosen])] = np.clip(part / deviation[:, None] / deviation, -1, 1)
+    return out
+
+
+def _cosine_rmse(residual: Array, theta_r_deg: Array | None) -> float | None:
+    if theta_r_deg is None:
+        return None
+    weight = np.abs(np.cos(np.radians(theta_r_deg)))
+    return math.sqrt(float(weight @ residual**2 / weight.sum()))
