@@ -21,7 +21,8 @@ DECADES = 2.0
 """A parameter whose bounds have one sign and lie this many decades apart, or more, is searched by its logarithm."""
 
 STATIONARY = 1e-5
-"""Largest relative offset of a minimum: the part of the residuals that the parameters could still take away, as a fraction of them."""
+"""Largest relative offset of a minimum, unless another is asked for: the part of the residuals that the parameters could still take
+away, as a fraction of them."""
 
 STEP = 1e-9
 """A last Gauss-Newton step below this fraction of the bounds' distance is no step: it decides where the residuals themselves vanish."""
@@ -34,6 +35,12 @@ SAME_PLACE = 1e-3
 
 AT_BOUND = 1e-6
 """A parameter this near a bound, as a fraction of the bounds' distance, is at it."""
+
+POLISH = 20
+"""Gauss-Newton steps of the polish, at most."""
+
+DIFFERENCE = 6e-6
+"""Half the span of central differences unless another is asked for: the cube root of the rounding error."""
 
 DRAWN = 8
 """Random points drawn for each descent that begins at the best of them."""
@@ -91,7 +98,7 @@ class Minimum:
         Whether `x` is a minimum within the bounds. It says nothing of others; see `disagreeing`.
     offset : float
         Bates and Watts' measure (Technometrics 23, 179, 1981): length of the residuals' part along the tangents of the parameters free to
-        move, over their length. 0 at a minimum; at most `STATIONARY` counts as one.
+        move, over their length. 0 at a minimum; at most `stationary` counts as one.
     stopped : str
         Why the polish ended.
     at_bounds : tuple of (int, str)
@@ -122,6 +129,7 @@ class Minimum:
     evaluations: int
     refused: int
     _box: _Box
+    _negligible: float  # difference between sums of squares
 
     @property
     def disagreeing(self) -> tuple[Restart, ...]:
@@ -130,13 +138,12 @@ class Minimum:
 
     def _same(self, restart: Restart) -> bool:
         near = np.max(np.abs(self._box.to_unit(restart.x) - self._box.to_unit(self.x))) <= SAME_PLACE
-        return bool(near) and restart.cost <= self.cost + SAME_COST * max(self.cost, math.ulp(1.0) * self._box.scale)
+        return bool(near) and restart.cost <= self.cost + self._negligible
 
     @property
     def rivals(self) -> tuple[Restart, ...]:
         """Descents that ended equally low at another place: the readings do not tell the two apart."""
-        limit = self.cost + SAME_COST * max(self.cost, math.ulp(1.0) * self._box.scale)
-        return tuple(r for r in self.disagreeing if r.cost <= limit)
+        return tuple(r for r in self.disagreeing if r.cost <= self.cost + self._negligible)
 
     @property
     def statement(self) -> str:
@@ -163,7 +170,6 @@ class _Box:
     upper: Array
     log: NDArray[np.bool_]
     sign: Array
-    scale: float = 1.0  # sum of squares of the worst residuals met at a descent's beginning
 
     @classmethod
     def of(cls, bounds: ArrayLike) -> _Box:
@@ -181,7 +187,8 @@ class _Box:
         log = one_sign & (np.log10(np.where(one_sign, large, 1)) - np.log10(np.where(one_sign, small, 1)) >= DECADES)
         return cls(box[:, 0], box[:, 1], log, np.where(box[:, 1] < 0, -1.0, 1.0))
 
-    def _ends(self) -> tuple[Array, Array]:
+    @property
+    def ends(self) -> tuple[Array, Array]:
         return self._bend(self.lower), self._bend(self.upper)
 
     def _bend(self, x: Array) -> Array:
@@ -190,56 +197,62 @@ class _Box:
         return bent
 
     def to_unit(self, x: Array) -> Array:
-        low, high = self._ends()
+        low, high = self.ends
         return np.clip((self._bend(x) - low) / (high - low), 0, 1)
 
     def from_unit(self, u: Array) -> Array:
-        low, high = self._ends()
+        low, high = self.ends
         x = low + u * (high - low)
         x[self.log] = self.sign[self.log] * np.exp(self.sign[self.log] * x[self.log])
         return np.clip(x, self.lower, self.upper)  # rounding only: u is within 0 to 1
 
 
-class _Refused(Exception):
-    """No finite residuals where a descent would begin."""
-
-
 class _Counted:
     """The residuals over the unit cube, checked and counted."""
 
-    def __init__(self, residuals: Callable[[Array], ArrayLike], box: _Box) -> None:
-        self.residuals, self.box = residuals, box
+    def __init__(self, residuals: Callable[[Array], ArrayLike], box: _Box, difference: float, stationary: float) -> None:
+        self.residuals, self.box, self.difference, self.stationary = residuals, box, difference, stationary
         self.evaluations = self.refused = 0
         self.size: int | None = None
+        self.raised: Exception | None = None
 
     def __call__(self, u: Array) -> Array:
         """Return the residuals; infinite, all of them, where any is not finite."""
         self.evaluations += 1
-        with np.errstate(all="ignore"):
-            found = np.asarray(self.residuals(self.box.from_unit(np.asarray(u, dtype=float))), dtype=float)
+        try:
+            with np.errstate(all="ignore"):
+                found = np.asarray(self.residuals(self.box.from_unit(np.asarray(u, dtype=float))), dtype=float)
+        except Exception as error:
+            self.raised = error  # so that it is not taken for an optimiser's own
+            raise
         if found.ndim != 1 or not found.size:
             raise FitError(f"the residuals must be a vector with at least one entry, not of shape {found.shape}")
         if self.size not in (None, found.size):
             raise FitError(f"the residuals changed their number from {self.size} to {found.size}")
         self.size = found.size
-        if not np.isfinite(found).all():
+        with np.errstate(all="ignore"):
+            usable = bool(np.isfinite(found @ found))
+        if not usable:
             self.refused += 1
             return np.full(found.size, np.inf)
         return found
 
     def cost(self, u: Array) -> float:
         found = self(u)
-        with np.errstate(over="ignore"):
-            return float(found @ found)
+        return float(found @ found)
 
-    def jacobian(self, u: Array, step: float = 6e-6) -> Array:
-        """Central differences within the cube; of one side at its faces."""
-        columns = []
+    def jacobian(self, u: Array) -> tuple[Array, bool]:
+        """Central differences within the cube, of one side at its faces and beside refused points; and whether all could be had."""
+        columns, complete = [], True
         for j in range(len(u)):
             ahead, behind = u.copy(), u.copy()
-            ahead[j], behind[j] = min(1.0, u[j] + step), max(0.0, u[j] - step)
-            columns.append((self(ahead) - self(behind)) / (ahead[j] - behind[j]))
-        return np.column_stack(columns)
+            ahead[j], behind[j] = min(1.0, u[j] + self.difference), max(0.0, u[j] - self.difference)
+            sides = [(v[j], found) for v in (ahead, behind) if np.isfinite(found := self(v)).all()]
+            if len(sides) == 1:
+                sides.append((u[j], self(u)))
+            complete &= len(sides) == 2
+            columns.append((sides[0][1] - sides[1][1]) / (sides[0][0] - sides[1][0]) if len(sides) == 2 else np.zeros(self.size or 0))
+        return np.column_stack(columns), complete
 
 
 def minimise(
@@ -250,6 +263,9 @@ def minimise(
     seed: int = 0,
     global_evaluations: int = 2000,
     starts: int = 4,
+    iterations: int = 500,
+    difference: float = DIFFERENCE,
+    stationary: float = STATIONARY,
 ) -> Minimum:
     """Minimise the sum of squares of residuals within bounds.
 
@@ -268,6 +284,13 @@ def minimise(
         Evaluations the global search may spend; 0 leaves it out.
     starts : int
         Further descents from random points.
+    iterations : int
+        Steps that one descent may try; each costs an evaluation, and 2p more where it is taken.
+    difference : float
+        Half the span of central differences, as a fraction of the bounds' distance. The default suits residuals exact to rounding; those
+        that come from a quadrature want more.
+    stationary : float
+        Largest relative offset of what is called a minimum (see `Minimum.offset`).
 
     Returns
     -------
@@ -282,10 +305,15 @@ def minimise(
     """
     box = _Box.of(bounds)
     p = len(box.lower)
+    if iterations < 1:
+        raise DomainError(f"iterations must be 1 or more, not {iterations}")
+    for name, fraction in (("difference", difference), ("stationary", stationary)):
+        if not 0 < fraction < 0.5:
+            raise DomainError(f"{name} must lie between 0 and 0.5, not {fraction}")
     for name, value in (("seed", seed), ("global_evaluations", global_evaluations), ("starts", starts)):
         if value < 0:
             raise DomainError(f"{name} must be 0 or more, not {value}")
-    function = _Counted(residuals, box)
+    function = _Counted(residuals, box, difference, stationary)
     begins: list[tuple[str, Array]] = []
     if start is not None:
         begins.append(("start", box.to_unit(_checked_start(start, box))))
@@ -301,19 +329,17 @@ def minimise(
     restarts, units, scale = [], [], 0.0
     for origin, u in begins:
         before = function.evaluations
-        try:
-            first, end, why = _descend(function, u)
-        except _Refused:
-            continue
+        if not math.isfinite(first := function.cost(u)):
+            raise FitError(
+                f"the residuals are not finite at the {origin} ({_listed(box.from_unit(u))}): begin elsewhere or narrow the bounds"
+            )
+        end, why = _descend(function, u, iterations)
+        at = _judge(function, end)
         scale = max(scale, first)
-        cost, offset, step, _ = _judge(function, end)
-        converged = offset <= STATIONARY or step <= STEP
         units.append(end)
         restarts.append(
-            Restart(origin, box.from_unit(u), box.from_unit(end), cost, converged, offset, why, function.evaluations - before)
+            Restart(origin, box.from_unit(u), box.from_unit(end), at.cost, at.converged, at.offset, why, function.evaluations - before)
         )
-    if not restarts:
-        raise FitError(f"the residuals are not finite where the descents begin ({', '.join(origin for origin, _ in begins)}): move the start")
     best = min(range(len(restarts)), key=lambda k: restarts[k].cost)
     return _polished(function, units[best], restarts, best, scale)
 
@@ -333,10 +359,16 @@ def _search(function: _Counted, p: int, seed: int, evaluations: int) -> Array | 
     import nlopt
 
     best: tuple[float, Array | None] = (math.inf, None)
+    raised: BaseException | None = None
 
     def objective(u: Array, _gradient: Array) -> float:
-        nonlocal best
-        cost = function.cost(np.clip(u, 0, 1))
+        nonlocal best, raised
+        try:
+            cost = function.cost(np.clip(u, 0, 1))
+        except BaseException as error:  # an exception must not pass through the C code, which would call again
+            raised = error
+            search.force_stop()
+            return 1e300
         if cost < best[0]:
             best = cost, np.clip(u, 0, 1)
         return min(cost, 1e300)  # NLopt compares costs, and infinity would end some of its steps
@@ -350,9 +382,13 @@ def _search(function: _Counted, p: int, seed: int, evaluations: int) -> Array | 
     search.set_ftol_rel(1e-6)  # the descent does the rest
     try:
         search.optimize(np.full(p, 0.5))
-    except (nlopt.RoundoffLimited, RuntimeError, ValueError):
-        if best[1] is None:
-            raise
+    except nlopt.RoundoffLimited:
+        pass  # as near as the search can come; it is a beginning only
+    except (nlopt.ForcedStop, RuntimeError) as error:
+        if raised is None:
+            raise FitError(f"the global search failed: {error}") from error
+    if raised is not None:
+        raise raised
     return best[1]
 
 
@@ -368,78 +404,104 @@ def _drawn(function: _Counted, p: int, seed: int, starts: int) -> list[Array]:
     return [points[k] for k in chosen if math.isfinite(costs[k])]
 
 
-def _descend(function: _Counted, u: Array) -> tuple[float, Array, str]:
-    """Go down from a point; return the sum of squares there, the end and why it is one."""
+def _descend(function: _Counted, u: Array, iterations: int) -> tuple[Array, str]:
+    """Go down from a point; return the end and why it is one."""
     from scipy.optimize import least_squares
 
-    first = function(u)
-    if not np.isfinite(first).all():
-        raise _Refused
     tight = 4 * np.finfo(float).eps
     inside = np.clip(u, 1e-9, 1 - 1e-9)
     try:
         with np.errstate(all="ignore"):
             found = least_squares(
-                function, inside, bounds=(0, 1), jac="3-point", method="trf", x_scale="jac", ftol=tight, xtol=tight, gtol=tight, max_nfev=500
+                function,
+                inside,
+                bounds=(0, 1),
+                jac=lambda at: function.jacobian(at)[0],
+                method="trf",
+                x_scale="jac",
+                ftol=tight,
+                xtol=tight,
+                gtol=tight,
+                max_nfev=iterations,
             )
     except (ValueError, np.linalg.LinAlgError) as error:
-        # Derivatives across a place without finite residuals: the descent ends where it began, and is judged there.
-        return float(first @ first), u, f"no derivatives: {error}"
+        if function.raised is not None:
+            raise
+        return u, f"the descent failed: {error}"  # judged where it began
     why = {0: "out of evaluations", 1: "no slope left", 2: "the cost falls no more", 3: "the step vanished", 4: "cost and step vanished"}
-    return float(first @ first), found.x, why[found.status]
+    return found.x, why[found.status]
 
 
-def _judge(function: _Counted, u: Array) -> tuple[float, float, float, Array]:
-    """Sum of squares, relative offset, Gauss-Newton step still to go (as a fraction of the bounds' distance), and Jacobian over the cube."""
+@dataclass(frozen=True, eq=False)
+class _Local:
+    """The residuals to first order about a point of the cube."""
+
+    cost: float
+    offset: float
+    step: Array  # of Gauss and Newton, for the parameters free to move; 0 for the others
+    held: NDArray[np.bool_]  # leaning on a bound
+    jacobian: Array
+    stationary: float
+
+    @property
+    def converged(self) -> bool:
+        return self.offset <= self.stationary or bool(np.max(np.abs(self.step)) <= STEP)
+
+
+def _judge(function: _Counted, u: Array) -> _Local:
     residual = function(u)
-    jacobian = function.jacobian(u)
+    jacobian, complete = function.jacobian(u)
     cost = float(residual @ residual)
-    if not np.isfinite(jacobian).all():
-        return cost, 1.0, 1.0, jacobian
     slope = jacobian.T @ residual
-    held = ((u <= AT_BOUND) & (slope >= 0)) | ((u >= 1 - AT_BOUND) & (slope <= 0))
+    held = ((u <= AT_BOUND) & (slope > 0)) | ((u >= 1 - AT_BOUND) & (slope < 0))
     length = np.linalg.norm(jacobian, axis=0)
     free = ~held & (length > 0)
+    step = np.zeros(len(u))
+    if not complete:
+        return _Local(cost, 1.0, step + 1, held, jacobian, function.stationary)  # hemmed in by refused points: not known to be a minimum
     if cost == 0 or not free.any():
-        return cost, 0.0, 0.0, jacobian
+        return _Local(cost, 0.0, step, held, jacobian, function.stationary)
     tangent, singular, turn = np.linalg.svd(jacobian[:, free] / length[free], full_matrices=False)
     known = singular > RANK_TOLERANCE * singular[0]
     along = tangent[:, known].T @ residual
-    step = turn[known].T @ (along / singular[known]) / length[free]
-    return cost, float(np.linalg.norm(along) / math.sqrt(cost)), float(np.max(np.abs(step))), jacobian
+    step[free] = -(turn[known].T @ (along / singular[known])) / length[free]
+    return _Local(cost, float(np.linalg.norm(along) / math.sqrt(cost)), step, held, jacobian, function.stationary)
 
 
 def _polished(function: _Counted, u: Array, restarts: list[Restart], best: int, scale: float) -> Minimum:
-    """Take the best descent's end to the last digits, onto its bounds where it leans on them, and judge it."""
+    """Take the best descent's end to the last digits, onto the bounds it leans on, and judge it."""
     box, why = function.box, restarts[best].stopped
-    lowest = function.cost(u)
-    for _ in range(4):
-        trial, why_now = _newton(function, u)
-        cost = function.cost(trial)
-        if cost > lowest:
+    here = _judge(function, u)
+    for _ in range(POLISH):
+        resting = np.where(here.held, np.round(u), u)
+        trials = [resting + part * here.step for part in (1.0, 0.3, 0.0)]
+        found = next((t for t in (np.clip(t, 0, 1) for t in trials) if not np.array_equal(t, u) and function.cost(t) < here.cost), None)
+        if found is None:
             break
-        u, why, gained = trial, why_now, lowest - cost
-        lowest = cost
-        if gained <= 1e-14 * lowest:
-            break
-    cost, offset, step, over_cube = _judge(function, u)
+        u, why, here = found, "polished until the sum of squares fell no more", _judge(function, found)
     x = box.from_unit(u)
-    low, high = box._ends()
-    # d u / d x: 1 / (high - low), by the chain rule of the logarithm where the search is logarithmic.
+    low, high = box.ends
+    # By the chain rule of the logarithm where the search is logarithmic.
     stretch = np.where(box.log, 1 / np.where(box.log, np.abs(x), 1), 1) / (high - low)
+    length = np.linalg.norm(here.jacobian, axis=0)
     return Minimum(
         x=x,
-        cost=cost,
+        cost=here.cost,
         residuals=function(u),
-        jacobian=over_cube * stretch,
-        converged=offset <= STATIONARY or step <= STEP,
-        offset=offset,
+        jacobian=here.jacobian * stretch,
+        converged=here.converged,
+        offset=here.offset,
         stopped=why,
-        at_bounds=tuple((i, "lower" if u[i] < 0.5 else "upper") for i in range(len(u)) if min(u[i], 1 - u[i]) <= AT_BOUND),
-        rank=_rank(over_cube),
+        at_bounds=tuple((i, "lower" if v < 0.5 else "upper") for i, v in enumerate(u) if min(v, 1 - v) <= AT_BOUND),
+        rank=int(np.linalg.matrix_rank(here.jacobian / np.where(length > 0, length, 1), tol=RANK_TOLERANCE)),
         restarts=tuple(restarts),
         best=best,
         evaluations=function.evaluations,
         refused=function.refused,
-        _box=_Box(box.lower, box.upper, box.log, box.sign, max(scale, cost)),
+        _box=box,
+        _negligible=SAME_COST * max(here.cost, math.ulp(1.0) * scale),
     )
+
+
+def _listed(x: Array) -> str:
+    return ", ".join(f"{v:.6g}" for v in x)

@@ -44,8 +44,8 @@ def read_alta(
     Returns
     -------
     Scattered
-        sigma is half the segment's length by `coverage`, or None where the header has no VS or 0. The sign of an azimuth difference is taken
-        as phi_r - phi_i [U]; a sample with mirror symmetry does not care.
+        sigma is half the segment's length by `coverage`, or None where the header has no VS or 0. An azimuth difference
+        is taken as phi_r - phi_i [U]; a sample with mirror symmetry does not care.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def write_alta(path: Path | str, data: Function | Brdf | Scattered, *, axes: Seq
 
 def _written(data: Scattered) -> Iterator[str]:
     count = len(data.channels)
-    colours = {("R", "G", "B"): "RGB_COLOR", ("X", "Y", "Z"): "XYZ_COLOR"}
+    colours: Mapping[tuple[str, ...], str] = {("R", "G", "B"): "RGB_COLOR", ("X", "Y", "Z"): "XYZ_COLOR"}
     yield f'#SAMPLE "{one_line(data.source)}"'
     yield f"#DIM 4 {count}"
     yield f"#VS{' 0' * count if data.sigma is None else ' 1' * count}"
@@ -189,7 +189,7 @@ def _placed(
         except _Outside as outside:
             bad = int(np.flatnonzero(outside.bad)[0])
             raise TableError(path, str(outside), rows[bad]) from None
-    angles[:, [0, 2]] = np.where(np.abs(angles[:, [0, 2]] - 180) < np.degrees(_SPAN), 180.0, angles[:, [0, 2]])
+    angles[:, 2] = np.where(np.abs(angles[:, 2] - 90) < np.degrees(_SPAN), 90.0, angles[:, 2])  # not behind by a rounding
     kept = np.ones(len(table), bool) if theta_r_below is None else angles[:, 2] < theta_r_below
     if not kept.any():
         raise TableError(path, f"no reading has theta_r below {theta_r_below:g} deg")
@@ -212,7 +212,10 @@ def _placed(
         values, sigma = values / cosine, None if sigma is None else sigma / cosine
     require(path, rows, np.all(np.isfinite(values), axis=1), "the value is too large")
     return Scattered(
-        *angles.T,
+        theta_i_deg=angles[:, 0],
+        phi_i_deg=angles[:, 1],
+        theta_r_deg=angles[:, 2],
+        phi_r_deg=angles[:, 3],
         values=values,
         sigma=sigma,
         channels=channels,

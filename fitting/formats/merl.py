@@ -10,6 +10,7 @@ variables for efficient BRDF representation", doi:10.1007/978-3-7091-6453-2_2.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,7 +65,7 @@ class Merl:
         return RGB
 
     def __call__(self, theta_i_deg: ArrayLike, theta_r_deg: ArrayLike, phi_deg: ArrayLike) -> Array:
-        """Look the reflectance up, linearly between the middles of those bins that have a value.
+        """Look the reflectance up, linearly between the middles of those bins that have a value, or else those next to them.
 
         Parameters
         ----------
@@ -82,7 +83,7 @@ class Merl:
         Raises
         ------
         DomainError
-            If a direction is not above the surface, or no bin about it has a value.
+            If a direction is not above the surface, or no bin about it, or within `EDGE` of it, has a value.
         """
         total, found = self._gathered(theta_i_deg, theta_r_deg, phi_deg)
         if not np.all(total > 0):
@@ -100,6 +101,14 @@ class Merl:
     def _gathered(self, theta_i: ArrayLike, theta_r: ArrayLike, phi: ArrayLike) -> tuple[Array, Array]:
         """Weight of the bins with a value about each direction, and the sum of their weighted values."""
         half, diff, around = half_difference(theta_i, theta_r, phi)
+        total, found = self._blended(half, diff, around)
+        # Writers leave out bins whose middle is below the horizon: what reaches above it is told by the bin next to them.
+        for inwards in range(1, math.ceil(EDGE) + 1):
+            if np.any(bare := total <= 0):
+                total[bare], found[bare] = self._blended(half[bare], diff[bare] - inwards, around[bare])
+        return total, found
+
+    def _blended(self, half: Array, diff: Array, around: Array) -> tuple[Array, Array]:
         places = (np.sqrt(90 * half), diff, np.mod(around, 180.0))
         lower = [np.floor(place - 0.5) for place in places]
         shares = [place - 0.5 - low for place, low in zip(places, lower, strict=True)]
@@ -265,7 +274,7 @@ def _counts(function: Function | Brdf) -> Array:
         theta_i, theta_r, phi = directions(half[part, None, None], diff[:, None], around)
         held = np.maximum(theta_i, theta_r) <= 90 + EDGE
         at = (np.minimum(theta_i[held], 90.0), np.minimum(theta_r[held], 90.0), phi[held])
-        swapped = (at[1], at[0], at[2])
+        swapped = (at[1], at[0], -at[2])
         ways = [at] if getattr(function, "reciprocal", False) else [at, swapped]
         if (covers := getattr(function, "covers", None)) is not None:
             known = np.all([covers(*way) for way in ways], axis=0)

@@ -51,7 +51,10 @@ def read_pab(paths: Path | str | Sequence[Path | str]) -> Scattered:
             raise TableError(path, f"same incidence, {incidence[0]:g} and {incidence[1]:g} deg, as {seen[incidence]}")
         seen[incidence] = path
     return Scattered(
-        *(np.concatenate([getattr(p, f"{name}_deg") for p in parts]) for name in ("theta_i", "phi_i", "theta_r", "phi_r")),
+        theta_i_deg=np.concatenate([p.theta_i_deg for p in parts]),
+        phi_i_deg=np.concatenate([p.phi_i_deg for p in parts]),
+        theta_r_deg=np.concatenate([p.theta_r_deg for p in parts]),
+        phi_r_deg=np.concatenate([p.phi_r_deg for p in parts]),
         values=np.concatenate([p.values for p in parts]),
         channels=first.channels,
         quantity=first.quantity,
@@ -94,9 +97,8 @@ def write_pab(
         raise DomainError(f"{listed.source}: a pab file holds one channel or X, Y, Z, not {', '.join(listed.channels)}")
     incidences = np.unique(np.column_stack([listed.theta_i_deg, listed.phi_i_deg]), axis=0).tolist()
     path = Path(path)
-    named = (
-        {path: at for at in incidences} if len(incidences) == 1 else {path.with_stem(f"{path.stem}_{_at(*at)}"): at for at in incidences}
-    )
+    alone = len(incidences) == 1
+    named = {path if alone else path.with_stem(f"{path.stem}_{_at('t', theta)}{_at('p', phi)}"): (theta, phi) for theta, phi in incidences}
     if len(named) < len(incidences):
         raise DomainError(f"{listed.source}: incidences closer than 0.001 deg cannot be told apart in the files' names")
     for file, (theta, phi) in named.items():
@@ -119,11 +121,9 @@ def _written(data: Scattered, chosen: np.ndarray, theta: float, phi: float, name
         yield "\t".join(map(repr, row))
 
 
-def _at(theta: float, phi: float) -> str:
-    """Short name of an incidence, whole degrees where they are."""
-    return "".join(
-        f"{letter}{angle:03.0f}" if angle == round(angle) else f"{letter}{angle:07.3f}" for letter, angle in zip("tp", (theta, phi))
-    )
+def _at(letter: str, angle: float) -> str:
+    """Short name of an angle, in whole degrees where it is."""
+    return f"{letter}{angle:03.0f}" if angle == round(angle) else f"{letter}{angle:07.3f}"
 
 
 def _read(path: Path | str) -> Scattered:

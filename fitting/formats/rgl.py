@@ -3,7 +3,7 @@
 A table of named arrays, their places and shapes, then the arrays. Values lie over the half vector m of light and view, at (u, v) with
 theta_m = u^2 pi/2 and phi_m = (2 v - 1) pi, phi_m counted from the light where the sample is isotropic, one picture for each direction of
 the light. In a measured file the pictures are warped so that the sample's facets (`vndf`) lie evenly, and divided by their number (`ndf`)
-over the area seen (`sigma`); a file written here has neither warp nor division. Times are of the view's cosine: a value is f_r cos(theta_r).
+over the area seen (`sigma`); a file written here has neither warp nor division: its values are f_r cos(theta_r).
 
 Source: J. Dupuy, W. Jakob 2018, "An adaptive parameterization for efficient material acquisition and rendering",
 doi:10.1145/3272127.3275059.
@@ -38,8 +38,8 @@ RGB = ("R", "G", "B")
 MOST_AXES = 32
 """Axes of an array; numpy takes no more everywhere."""
 
-GREY_NM = (300.0, 1100.0)
-"""Wavelengths that a grey function is written for, beside R, G, B: what renderers ask lies between."""
+LIGHTS_DEG = 90 * (1 - (1 - np.linspace(0, 1, 33)) ** 1.5)
+"""Light's angles of a file: closer towards grazing, where a domed surface changes quickly."""
 
 FLATTEST_DEG = 89.99
 """Largest view angle that f_r cos(theta_r) can be divided by its cosine at."""
@@ -124,7 +124,7 @@ class Rgl:
         angles = np.broadcast_arrays(*(np.asarray(a, float) for a in (theta_i_deg, phi_i_deg, theta_r_deg, phi_r_deg)))
         if not np.all(self.covers(angles[0], angles[2], angles[3] - angles[1])):
             raise DomainError(
-                f"{self.source}: a direction is outside the file: it has theta_i of {self.theta_i_deg[0]:g} to {self.theta_i_deg[-1]:g} deg, "
+                f"{self.source}: a direction is outside the file: it has theta_i of {self.theta_i_deg[0]:g} to {self.theta_i_deg[-1]:g}, "
                 f"and theta_r below {FLATTEST_DEG:g} deg"
             )
         theta_i, phi_i, theta_r, phi_r = (np.radians(a).ravel() for a in angles)
@@ -191,7 +191,9 @@ class Rgl:
         c0 = (1 - y) * mixed(density, row, column) + y * mixed(density, row + 1, column)
         c1 = (1 - y) * mixed(density, row, column + 1) + y * mixed(density, row + 1, column + 1)
         begun = (1 - y) * mixed(along, row, column) + y * mixed(along, row + 1, column)
-        s = (begun + x * (c0 + x * (c1 - c0) / 2) / (columns - 1)) / ((1 - y) * r0 + y * r1)
+        facets = (1 - y) * r0 + y * r1
+        some = facets > 0  # where there are none, any order among them will do
+        s = np.where(some, (begun + x * (c0 + x * (c1 - c0) / 2) / (columns - 1)) / np.where(some, facets, 1.0), u)
         t = mixed(above, row) + y * (r0 + y * (r1 - r0) / 2) / (rows - 1)
         return np.clip(s, 0, 1), np.clip(t, 0, 1)  # no more than rounding is cut off
 
@@ -270,7 +272,7 @@ class _Tensors:
         if entry.dtype != np.dtype(dtype) or not fits:
             raise TableError(
                 self.path,
-                f"byte {entry.at}: array {name!r} is {entry.dtype.name} of shape {entry.shape}, expected {np.dtype(dtype).name} of {wanted}",
+                f"byte {entry.at}: array {name!r}: {entry.dtype.name} of shape {entry.shape}, expected {np.dtype(dtype).name} of {wanted}",
             )
         numbers = np.frombuffer(self.data[entry.offset : entry.offset + entry.size], entry.dtype).reshape(entry.shape)
         if numbers.dtype.kind == "f" and not np.all(finite := np.isfinite(numbers)):
@@ -316,29 +318,29 @@ def _reflectance(file: _Tensors) -> Rgl:
     lights = [len(phi_i), len(theta_i)]
     ndf, sigma = (file.array(name, "<f4", [None, None]) for name in ("ndf", "sigma"))
     vndf = file.array("vndf", "<f4", [*lights, None, None])
+    channels: tuple[str, ...]
     if "rgb" in file.entries:
         pictures, channels = "rgb", RGB
     else:
         pictures = "spectra"
         channels = tuple(f"{nm:.6g} nm" for nm in file.array("wavelengths", "<f4", [None]))
     values = file.array(pictures, "<f4", [*lights, len(channels), None, None])
+    if values.shape[3] != values.shape[4]:
+        raise file.refuse(pictures, f"has pictures of shape {values.shape[3:]}, expected squares")
     luminance = file.array("luminance", "<f4", [*lights, *values.shape[3:]])
     divided = bool(file.array("jacobian", "u1", [1])[0])
     for name, table in (("ndf", ndf), ("sigma", sigma), ("vndf", vndf), (pictures, values)):
         if min(table.shape[-2:]) < 2:
             raise file.refuse(name, f"has pictures of shape {table.shape[-2:]}, expected two or more each way")
-    if values.shape[3] != values.shape[4]:
-        raise file.refuse(pictures, f"has pictures of shape {values.shape[3:]}, expected squares")
     if len(set(channels)) < len(channels):
         raise file.refuse("wavelengths", "has one twice")
-    # A row without any facets has no order among them, and an area of 0 divides nothing.
-    if np.any(vndf < 0) or np.any(vndf.sum(axis=-1, dtype=float) <= 0):
-        raise file.refuse("vndf", "must be 0 or more, and more somewhere in every row")
+    if np.any(vndf < 0) or not np.all(vndf.any(axis=(2, 3))):
+        raise file.refuse("vndf", "must be 0 or more, and more somewhere in every picture")
     if divided and np.any(sigma <= 0):
         raise file.refuse("sigma", "must be more than 0")
-    degrees = [np.degrees(axis.astype(float)) for axis in (theta_i, phi_i)]
+    lit, around = (np.degrees(axis.astype(float)) for axis in (theta_i, phi_i))
     said = file.array("description", "u1", [None]).tobytes().decode("utf-8", "replace")
-    return Rgl(*degrees, ndf, sigma, vndf, values, luminance, divided, channels, said, str(file.path))
+    return Rgl(lit, around, ndf, sigma, vndf, values, luminance, divided, channels, said, str(file.path))
 
 
 def write_rgl(
@@ -358,12 +360,13 @@ def write_rgl(
         The file; what is there is replaced once the new one is whole.
     function : callable
         f(theta_i, theta_r, phi) in deg -> 1/sr, of one channel (grey), three (R, G, B) or one for each wavelength. As renderers that
-        follow paths from the eye take theta_i for the view's, it is drawn as it is only if light and view may be swapped.
+        follow paths from the eye take theta_i for the view's, it is drawn as it is only if light and view may be swapped. Pictures end at
+        the horizon and are linear across it: within 2 deg of it the file's f_r is coarse, though not the light it stands for.
     wavelengths_nm : sequence of float, optional
-        Of the function's channels, rising: a spectral file is written, for renderers' spectral variants. R, G, B are for their RGB
-        variants, and a grey file is for both.
+        Of the function's channels, rising; a grey function needs two or more that enclose what will be rendered. With them a spectral file
+        is written, for Mitsuba's spectral variants and pbrt, without them one of R, G, B for Mitsuba's RGB variants: neither loads both.
     theta_i_deg : array_like, deg, optional
-        Light's angles, rising from 0 to 90 at most; by default 33, evenly.
+        Light's angles, rising within 0 to 90; by default `LIGHTS_DEG`.
     resolution : int
         Points along either side of a picture.
     description : str
@@ -381,7 +384,7 @@ def write_rgl(
         raise DomainError("an RGL file holds reflection only, and this is transmission")
     if not 2 <= resolution <= 4096:
         raise DomainError(f"resolution must be 2 to 4096 points, not {resolution}")
-    lights = np.atleast_1d(np.asarray(np.linspace(0, 90, 33) if theta_i_deg is None else theta_i_deg, float))
+    lights = np.atleast_1d(np.asarray(LIGHTS_DEG if theta_i_deg is None else theta_i_deg, float))
     if lights.ndim != 1 or not np.all(np.diff(lights) > 0) or not np.all((lights >= 0) & (lights <= 90)):
         raise DomainError(f"theta_i must rise within 0 to 90 deg, not {lights}")
     arrays: dict[str, NDArray[Any]] = {
@@ -395,16 +398,17 @@ def write_rgl(
     }
     if wavelengths_nm is not None:
         waves = np.asarray(wavelengths_nm, float)
-        if waves.shape != (len(names),) or not np.all(np.diff(waves) > 0) or not np.all((waves > 0) & (waves < 1e6)):
+        rising = waves.ndim == 1 and waves.size and np.all(np.diff(waves) > 0) and np.all((waves > 0) & (waves < 1e6))
+        if not rising or len(names) not in (1, waves.size):
             raise DomainError(f"the function has {len(names)} channels: expected as many wavelengths in nm, rising, not {waves}")
     elif len(names) != 1 and names != RGB:
         raise DomainError(f"the channels {', '.join(names)} are neither grey nor R, G, B: give their wavelengths")
     pictures, arrays["luminance"] = _pictures(function, lights, resolution, len(names))
     if wavelengths_nm is None:
         arrays["rgb"] = np.broadcast_to(pictures, (1, len(lights), 3, resolution, resolution))
-    if wavelengths_nm is not None or len(names) == 1:
-        arrays["wavelengths"] = np.asarray(GREY_NM if wavelengths_nm is None else wavelengths_nm, "<f4")
-        arrays["spectra"] = np.broadcast_to(pictures, (1, len(lights), len(arrays["wavelengths"]), resolution, resolution))
+    else:
+        arrays["wavelengths"] = waves.astype("<f4")
+        arrays["spectra"] = np.broadcast_to(pictures, (1, len(lights), len(waves), resolution, resolution))
     try:
         with replacing(path) as temporary:
             _write_tensors(temporary, arrays)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from fitting.errors import DomainError, FitError, TableError
+from fitting.errors import DomainError, TableError
 from fitting.formats import replacing
 from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered
 from fitting.measurements import Measurements
@@ -141,7 +142,10 @@ def readings(data: Function | Brdf | Scattered, axes: Sequence[Array] = AXES) ->
     phi_i = np.zeros(1) if grid.phi_i_deg is None else grid.phi_i_deg
     nodes = np.meshgrid(grid.theta_i_deg, phi_i, grid.theta_r_deg, grid.phi_r_deg, indexing="ij")
     return Scattered(
-        *(node.ravel() for node in nodes),
+        theta_i_deg=nodes[0].ravel(),
+        phi_i_deg=nodes[1].ravel(),
+        theta_r_deg=nodes[2].ravel(),
+        phi_r_deg=nodes[3].ravel(),
         values=grid.values.reshape(-1, len(grid.channels)),
         channels=grid.channels,
         quantity=grid.quantity,
@@ -223,9 +227,9 @@ def write_csv(path: Path | str, data: Function | Brdf | Scattered | Measurements
         columns |= {f"{listed.quantity}{part}_per_sr": column for part, column in zip(parts, listed.values.T, strict=True)}
         if listed.sigma is not None:
             columns |= {f"sigma{part}_per_sr": column for part, column in zip(parts, listed.sigma.T, strict=True)}
+    source = data.source if isinstance(data, Brdf | Scattered | Measurements) else "a function"
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    source = f"# {one_line(data.source)}" if isinstance(data, Brdf | Scattered | Measurements) else "# from a function"
-    write_lines(path, (line for part in ([source, ",".join(columns)], (",".join(map(repr, row)) for row in rows)) for line in part))
+    write_lines(path, chain([f"# {one_line(source)}", ",".join(columns)], (",".join(map(repr, row)) for row in rows)))
 
 
 def read_table(path: Path | str) -> Scattered:
@@ -256,14 +260,14 @@ def read_table(path: Path | str) -> Scattered:
             table.append(numbers(path, number, cells, names))
             rows.append(number)
         else:
-            names, header = cells, number
-            quantity, channels, sigmas = _columns(path, header, names)
+            names = cells
+            quantity, channels, sigmas = _columns(path, number, names)
     if not table:
         raise TableError(path, "no readings found; expected a line that names the columns, and numbers below it")
     at = np.array(table)
     columns = {name: at[:, k] for k, name in enumerate(names)}
     angles = np.column_stack([columns[name] for name in ANGLES])
-    require(path, rows, (at[:, names.index("theta_i_deg")] >= 0) & (angles[:, 0] <= 180), "theta_i is not within 0 to 180 deg")
+    require(path, rows, (angles[:, 0] >= 0) & (angles[:, 0] <= 180), "theta_i is not within 0 to 180 deg")
     require(path, rows, (angles[:, 2] >= 0) & (angles[:, 2] <= 180), "theta_r is not within 0 to 180 deg; the side is said by phi_r")
     once(path, angles, rows)
     part = [f"_{name}" if name != "value" else "" for name in channels]
@@ -271,7 +275,8 @@ def read_table(path: Path | str) -> Scattered:
     if sigma is not None:
         require(path, rows, np.all(sigma >= 0, axis=1), "sigma is below 0")
     values = np.column_stack([columns[f"{quantity}{p}_per_sr"] for p in part])
-    return Scattered(*angles.T, values=values, sigma=sigma, channels=channels, quantity=quantity, source=str(path))
+    theta_i, phi_i, theta_r, phi_r = angles.T
+    return Scattered(theta_i, phi_i, theta_r, phi_r, values=values, sigma=sigma, channels=channels, quantity=quantity, source=str(path))
 
 
 def require(path: Path | str, rows: Sequence[int], good: np.ndarray, problem: str) -> None:
@@ -294,7 +299,7 @@ def _columns(path: Path | str, line: int, names: list[str]) -> tuple[Quantity, t
         if head not in found or not name.endswith("_per_sr"):
             raise TableError(path, f"column {name!a} is not understood; expected brdf_per_sr, btdf_per_sr or sigma_per_sr, in 1/sr", line)
         found[head].append(rest.removesuffix("per_sr").rstrip("_") or "value")
-    kinds: list[Quantity] = [q for q in ("brdf", "btdf") if found[q]]  # type: ignore[misc]  # members of Quantity
+    kinds: list[Quantity] = [q for q in ("brdf", "btdf") if found[q]]
     if len(kinds) != 1:
         raise TableError(path, "expected columns of either brdf or btdf", line)
     channels = tuple(found[kinds[0]])
@@ -308,19 +313,3 @@ def _is_number(cell: str) -> bool:
         return math.isfinite(float(cell)) and "_" not in cell
     except ValueError:
         return False
-
-
-__all__ = [
-    "FitError",
-    "in_plane",
-    "lines",
-    "numbers",
-    "once",
-    "one_line",
-    "read_table",
-    "readings",
-    "require",
-    "whole",
-    "write_csv",
-    "write_lines",
-]
