@@ -4,6 +4,7 @@ What each owes the engine: https://blueskyproject.io/bluesky/main/hardware.html
 """
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -106,7 +107,7 @@ class Axis(Configured):
         self._profile = driver.profile()
         self._identity = driver.identify()
         self._moving: Status | None = None
-        self._stopped = False
+        self._stopped = threading.Event()
         self._setpoint = math.nan
         self._readback = math.nan
         self._homed = False
@@ -163,11 +164,11 @@ class Axis(Configured):
         """
         self.check_value(value)
         target = float(value)
-        return self._begin(self._move(target), target)
+        return self._begin(lambda stopped: self._move(target, stopped), target)
 
     def home(self) -> Status:
         """Find the stage's reference; the status ends when it stands there."""
-        return self._begin(self._home(), math.nan)
+        return self._begin(self._home, math.nan)
 
     def stop(self, success: bool = True) -> None:
         """Stop at once, from any thread.
@@ -175,7 +176,7 @@ class Axis(Configured):
         A move of ours that is under way counts as ended well (the engine then repeats it when resumed);
         a stop that nobody asked for fails the move.
         """
-        self._stopped = True
+        self._stopped.set()
         self.driver.stop()
 
     def locate(self) -> dict[str, float]:
@@ -204,55 +205,56 @@ class Axis(Configured):
 
     # -- motion --------------------------------------------------------------------------------------------------------
 
-    def _begin(self, task: Task, target: float) -> Status:
-        self._stopped = False
+    def _begin(self, task: Callable[[threading.Event], Task], target: float) -> Status:
+        # A motion that was told to stop may still be under way on the bus when the next one begins: each has its own flag.
+        self._stopped = threading.Event()
         self._setpoint = target
-        self._moving = self._bus.start(task)
+        self._moving = self._bus.start(task(self._stopped))
         return self._moving
 
-    def _move(self, target: float) -> Task:
+    def _move(self, target: float, stopped: threading.Event) -> Task:
         axis_deg = self.map.to_axis(target)
         state = self.driver.state()
         self._readback = self.map.to_theta(state.position_deg)
         if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance_deg:
             return
         duration = self._profile.duration_s(abs(self._readback - target))
-        if not self._started(lambda: self.driver.start_move(axis_deg)):
+        if not self._started(lambda: self.driver.start_move(axis_deg), stopped):
             return
-        yield from self._until_idle(f"the move to {target:g} deg", duration)
-        if not self._stopped:
+        yield from self._until_idle(f"the move to {target:g} deg", duration, stopped)
+        if not stopped.is_set():
             self.driver.check_arrival(axis_deg, self.tolerance_deg)
             yield self.settle_s
         self.refresh()
 
-    def _home(self) -> Task:
-        if not self._started(self.driver.start_home):
+    def _home(self, stopped: threading.Event) -> Task:
+        if not self._started(self.driver.start_home, stopped):
             return
-        yield from self._until_idle("homing", self._profile.duration_s(360.0), predicted=False)
-        if not self._stopped:
+        yield from self._until_idle("homing", self._profile.duration_s(360.0), stopped, predicted=False)
+        if not stopped.is_set():
             yield self.settle_s
         self.refresh()
-        if not self._stopped and not self._homed:
+        if not stopped.is_set() and not self._homed:
             raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
 
-    def _started(self, start: Callable[[], None]) -> bool:
+    def _started(self, start: Callable[[], None], stopped: threading.Event) -> bool:
         """Start a motion unless a stop was asked for meanwhile; return whether it runs."""
-        if self._stopped:
+        if stopped.is_set():
             return False
         try:
             start()
         except DeviceFault:
-            if self._stopped:  # the driver would not let it follow the stop
+            if stopped.is_set():  # the driver would not let it follow the stop
                 return False
             raise
-        if self._stopped:  # the stop overtook the start before the driver could know
+        if stopped.is_set():  # the stop overtook the start before the driver could know
             self.driver.stop()
         return True
 
-    def _until_idle(self, what: str, duration: float, *, predicted: bool = True) -> Task:
+    def _until_idle(self, what: str, duration: float, stopped: threading.Event, *, predicted: bool = True) -> Task:
         started = self._clock.monotonic()
         if predicted:
-            yield from self._watch(duration)
+            yield from self._watch(duration, stopped)
         while self.driver.state().moving:
             elapsed = self._clock.monotonic() - started
             if elapsed > 3 * duration + 5.0:
@@ -262,10 +264,10 @@ class Axis(Configured):
                 )
             yield POLL_S * self._clock.speed
 
-    def _watch(self, duration: float) -> Task:
+    def _watch(self, duration: float, stopped: threading.Event) -> Task:
         """Wait out a predicted travel, yet notice within 50 ms that the axis was told to stop."""
         end = self._clock.monotonic() + duration
-        while not self._stopped and (left := end - self._clock.monotonic()) > 0:
+        while not stopped.is_set() and (left := end - self._clock.monotonic()) > 0:
             yield min(left, 0.05 * self._clock.speed)
 
 

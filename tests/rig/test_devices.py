@@ -91,6 +91,24 @@ def test_a_stop_that_nobody_asked_for_fails_the_move(bench: Bench) -> None:
     assert isinstance(move.exception(10), DeviceFault)
 
 
+def test_a_stopped_move_ends_well_though_the_next_has_begun(bench: Bench) -> None:
+    detector = bench.axes["detector"]
+    detector.set(-80.0).wait(10)
+    first = detector.set(40.0)
+    while not detector.driver.state().moving:
+        pass
+    gate = threading.Event()
+    detector._bus.call(lambda: gate.wait(10))  # the bus is busy elsewhere while the arm comes to rest
+    detector.stop()
+    while detector.driver.state().moving:
+        pass
+    second = detector.set(-70.0)
+    gate.set()
+    assert first.exception(10) is None
+    second.wait(10)
+    assert detector.position == pytest.approx(-70.0, abs=0.01)
+
+
 def test_set_returns_at_once(bench: Bench) -> None:
     assert not bench.axes["detector"].set(-60.0).done
     bench.axes["detector"].stop()
