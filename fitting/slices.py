@@ -10,7 +10,8 @@ trigonometric function.
 What remains is the mean over the slice's place y = sin(eta) and the lattice's azimuth, on a two-dimensional Fibonacci lattice rule. The
 lattice repeats every 60 deg, and turning a slice over (y, azimuth -> -y, -azimuth) changes nothing, so half of the nodes are enough.
 
-All the kernels live in this one file because numba's cache notices a change only in the file of the function it cached.
+All the kernels live in this one file, but for `power`, whose meaning will not change: numba's cache notices a change only in the file of
+the function it cached.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from fitting.cells import CELL_AREA
+from fitting.power import power
 
 Array = NDArray[np.float64]
 
@@ -72,21 +74,6 @@ def reach(sin_t: float, cos_t: float, y: float, lattice: tuple[float, float, flo
                 off += y2
             i += 1
     return cos_t if edge == rim else max(-1.0, edge / rho)
-
-
-@njit(cache=True, nogil=True)
-def power(x: float, exponent: float) -> float:
-    """Raise to a power; whole exponents, the usual ones, by squaring, several times quicker."""
-    whole = int(exponent)
-    if whole != exponent or whole > 4096:
-        return x**exponent
-    out = 1.0
-    while whole:
-        if whole & 1:
-            out *= x
-        x *= x
-        whole >>= 1
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -5,7 +5,8 @@ point sees what is above a single slope, its horizon: the greatest slope from th
 half-ellipsoids, leaning ones too, the plane cuts an ellipse and the tangent to it has a closed form; else Newton's method finds it on the
 convex profile. Nothing is sampled along a ray.
 
-All the kernels live in this one file because numba's cache notices a change only in the file of the function it cached.
+All the kernels live in this one file, but for `power`, whose meaning will not change: numba's cache notices a change only in the file of
+the function it cached.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from fitting.cells import Cell
 from fitting.errors import DomainError
+from fitting.power import power
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -310,21 +312,6 @@ def bits_set(word: np.uint64) -> np.uint64:
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
     return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
-
-
-@njit(cache=True, nogil=True)
-def power(x: float, exponent: float) -> float:
-    """Raise to a power; whole exponents, the usual ones, by squaring, several times quicker."""
-    whole = int(exponent)
-    if whole != exponent or whole > 4096:
-        return x**exponent
-    out = 1.0
-    while whole:
-        if whole & 1:
-            out *= x
-        x *= x
-        whole >>= 1
-    return out
 
 
 class Facets(NamedTuple):

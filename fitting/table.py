@@ -135,25 +135,9 @@ class ReflectanceTable:
         Raises
         ------
         DomainError
-            If these do not fit together, or a value is negative or not finite.
-        EnergyError
-            If a BRDF among them sends back more light than falls on the petal.
+            If these do not fit together, or a value is negative or not finite. Whether a BRDF sends back more light than falls on the
+            petal is found out by `mixed`.
         """
-        table = cls._fitting_together(names, arrays, nodes, mode, provenance)
-        for name in table.names:
-            table.alone(name)  # raises where it creates light
-        return table
-
-    @classmethod
-    def _fitting_together(
-        cls,
-        names: Sequence[str],
-        arrays: Sequence[ArrayLike] | Mapping[str, ArrayLike],
-        nodes: tuple[ArrayLike, ArrayLike, ArrayLike],
-        mode: str,
-        provenance: Mapping[str, Any],
-    ) -> ReflectanceTable:
-        """`from_basis`, but for the energy."""
         from fitting.interpolate import axis  # numba
 
         axes = tuple(axis(along, grazing=name != "phi") for name, along in zip(("theta_i", "theta_r", "phi"), nodes, strict=True))
@@ -190,7 +174,7 @@ class ReflectanceTable:
 
     @classmethod
     def from_stored(cls, about: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> ReflectanceTable:
-        """Undo `stored`; what else the two hold is left alone. A mixture that creates light is found out by `mixed`.
+        """Undo `stored`; what else the two hold is left alone.
 
         Raises
         ------
@@ -202,7 +186,7 @@ class ReflectanceTable:
             theta_i, theta_r, phi, values = (arrays[name] for name in ("theta_i", "theta_r", "phi", "values"))
         except (KeyError, TypeError, ValueError) as error:
             raise DomainError(f"not a reflectance table ({type(error).__name__}: {error}): tabulate it again") from error
-        return cls._fitting_together(names, list(values), (theta_i, theta_r, phi), mode, provenance)
+        return cls.from_basis(names, list(values), nodes=(theta_i, theta_r, phi), mode=mode, provenance=provenance)
 
     def evaluate(self, theta_i_deg: ArrayLike, theta_r_deg: ArrayLike, phi_deg: ArrayLike) -> Array:
         """Look all basis functions up.
@@ -424,11 +408,11 @@ def _tabulated(
         "sampling": asdict(rule),
     }
     unit = INTENSITY if mode == "paper" else PER_SR
+    table = ReflectanceTable.from_basis(TERMS, bases, nodes=(theta, theta, grid.phi), mode=unit, provenance=provenance)
     try:
-        table = ReflectanceTable.from_basis(TERMS, bases, nodes=(theta, theta, grid.phi), mode=unit, provenance=provenance)
+        off = _between(table, lambda theta, phi: integrate(theta, phi, stage(progress, 0.8, 1)))
     except EnergyError as error:  # physics has none to give: a lobe between the nodes is drawn too wide
         raise DomainError(f"the grid is too coarse for what is reflected ({error}): ask for a finer grid") from error
-    off = _between(table, lambda theta, phi: integrate(theta, phi, stage(progress, 0.8, 1)))
     for name, exponent in (("u_spec", f"n_us = {n_us:g}"), ("s_spec", f"n_ss = {n_ss:g}")):
         if off[name] > LOBE_ERROR:
             raise DomainError(

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitting.errors import DomainError, FitError, TableError
-from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered
-from fitting.formats.table_csv import AXES, lines, numbers, once, one_line, readings, require, whole, write_lines
+from fitting.formats.grid import AXES, Array, Brdf, Function, Quantity, Scattered, readings
+from fitting.formats.text import lines, numbers, once, one_line, require, whole, write_lines
 
 MOST_CHANNELS = 4096
 TIMES_COS = "INV_STERADIAN_COSINE_FACTOR"

@@ -22,6 +22,10 @@ Function = Callable[[Any, Any, Any], Any]
 """f(theta_i, theta_r, phi) in deg -> 1/sr, of their broadcast shape or with one more axis for channels; a `Reflectance` is one."""
 
 
+AXES = (np.arange(0.0, 81, 10), np.arange(0.0, 86, 5), np.arange(0.0, 356, 5))
+"""Where a function is asked for a list of readings: theta_i, theta_r and phi_r - phi_i, deg."""
+
+
 @dataclass(frozen=True, eq=False)
 class Brdf:
     """Values on a grid of directions.
@@ -232,6 +236,39 @@ class Scattered:
 
     def __len__(self) -> int:
         return len(self.values)
+
+
+def readings(data: Function | Brdf | Scattered, axes: Sequence[Array] = AXES) -> Scattered:
+    """List what is to be written, reading by reading.
+
+    Parameters
+    ----------
+    data : callable, Brdf or Scattered
+        A function is asked at every combination of `axes`; a grid is written node by node.
+    axes : sequence of three ndarray, deg
+        theta_i, theta_r and phi_r - phi_i.
+
+    Raises
+    ------
+    DomainError
+        If the function is no BRDF.
+    """
+    if isinstance(data, Scattered):
+        return data
+    grid = data if isinstance(data, Brdf) else Brdf.sampled(data, *axes)
+    phi_i = np.zeros(1) if grid.phi_i_deg is None else grid.phi_i_deg
+    nodes = np.meshgrid(grid.theta_i_deg, phi_i, grid.theta_r_deg, grid.phi_r_deg, indexing="ij")
+    return Scattered(
+        theta_i_deg=nodes[0].ravel(),
+        phi_i_deg=nodes[1].ravel(),
+        theta_r_deg=nodes[2].ravel(),
+        phi_r_deg=nodes[3].ravel(),
+        values=grid.values.reshape(-1, len(grid.channels)),
+        channels=grid.channels,
+        quantity=grid.quantity,
+        source=grid.source,
+        metadata=grid.metadata,
+    )
 
 
 def channel_names(function: Function) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from fitting.errors import DomainError, TableError
 from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered, ask
-from fitting.formats.table_csv import write_lines
+from fitting.formats.text import write_lines
 
 Side = Literal["front", "back"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from fitting.errors import DomainError, TableError
-from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered
-from fitting.formats.table_csv import AXES, lines, numbers, once, one_line, readings, require, whole, write_lines
+from fitting.formats.grid import AXES, Array, Brdf, Function, Quantity, Scattered, readings
+from fitting.formats.text import lines, numbers, once, one_line, require, whole, write_lines
 
 XYZ = ("X", "Y", "Z")
 FORMATS = {"dsf": True, "bsdf": False, "brdf": False, "btdf": False}

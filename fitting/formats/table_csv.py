@@ -1,157 +1,20 @@
-"""Tables as text: what the line-by-line formats share, and CSV with named columns, which `fitting.read_csv` also reads."""
+"""CSV with named columns, which `fitting.read_csv` also reads."""
 
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from fitting.errors import DomainError, TableError
-from fitting.formats import replacing
-from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered
+from fitting.formats.grid import Brdf, Function, Quantity, Scattered, readings
+from fitting.formats.text import lines, numbers, once, one_line, require, write_lines
 from fitting.measurements import Measurements
-
-LONGEST_LINE = 1 << 16
-"""Characters; what is longer is no line of a table."""
-
-AXES = (np.arange(0.0, 81, 10), np.arange(0.0, 86, 5), np.arange(0.0, 356, 5))
-"""Where a function is asked for a list of readings: theta_i, theta_r and phi_r - phi_i, deg."""
 
 ANGLES = ("theta_i_deg", "phi_i_deg", "theta_r_deg", "phi_r_deg")
 VALUE_COLUMNS = {"brdf": "brdf_per_sr", "reflectance-factor": "reflectance_factor", "intensity": "intensity"}
-
-
-def lines(path: Path | str) -> Iterator[tuple[int, str]]:
-    """Read a text file line by line.
-
-    Yields
-    ------
-    number, line : int, str
-        From 1, and without the white space around it. Bytes that are not UTF-8 are passed on as they are: old comments hold them.
-
-    Raises
-    ------
-    TableError
-        If the file cannot be read or is not made of lines.
-    """
-    try:
-        with Path(path).open(encoding="utf-8-sig", errors="surrogateescape") as file:
-            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), ""), 1):
-                if len(line) >= LONGEST_LINE or "\0" in line:
-                    raise TableError(path, "not a table of text: expected lines of numbers", number)
-                yield number, line.strip()
-    except OSError as error:
-        raise TableError(path, f"cannot be read: {error.strerror or error}") from error
-
-
-def numbers(path: Path | str, line: int, cells: Sequence[str], names: Sequence[str]) -> list[float]:
-    """Read one row of numbers.
-
-    Raises
-    ------
-    TableError
-        With the line, if there are more or fewer than `names`, or one is not a finite number.
-    """
-    if len(cells) != len(names):
-        raise TableError(path, f"{len(cells)} numbers, expected {len(names)}: {', '.join(names)}", line)
-    try:
-        row = [float(cell) for cell in cells]
-        if all(map(math.isfinite, row)) and not any("_" in cell for cell in cells):
-            return row
-    except ValueError:
-        pass
-    bad = next(k for k, cell in enumerate(cells) if not _is_number(cell))
-    raise TableError(path, f"{names[bad]} is {cells[bad]!a}, expected a finite number", line)
-
-
-def whole(path: Path | str, line: int, text: str, name: str, most: int) -> int:
-    """Read a count, 0 to `most`; TableError with the line if it is none."""
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
-        raise TableError(path, f"{name} is {text!a}, expected a whole number of at most {most}", line)
-    return int(text)
-
-
-def write_lines(path: Path | str, written: Iterable[str]) -> None:
-    """Write a text file, whole or not at all.
-
-    Raises
-    ------
-    TableError
-        If it cannot be written.
-    """
-    try:
-        with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(line + "\n" for line in written)
-    except OSError as error:
-        raise TableError(path, f"cannot be written: {error.strerror or error}") from error
-
-
-def one_line(text: object) -> str:
-    """Make a header's value of anything: one line without quotes, of a bounded length."""
-    return " ".join(str(text).replace('"', "'").split())[:500]
-
-
-def once(path: Path | str, directions: Array, rows: Sequence[int]) -> None:
-    """Refuse two readings of one geometry.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file.
-    directions : ndarray, shape (n, k)
-        Angles as the file has them.
-    rows : sequence of int
-        Line of each.
-
-    Raises
-    ------
-    TableError
-        With the line of the second.
-    """
-    if not len(directions):
-        return
-    order = np.lexsort(directions.T[::-1])  # stable: the later line comes second
-    same = np.flatnonzero(np.all(np.diff(directions[order], axis=0) == 0, axis=1))
-    if same.size:
-        first, second = min((rows[order[k]], rows[order[k + 1]]) for k in same)
-        raise TableError(path, f"same angles as in line {first}: average the two or leave one out", second)
-
-
-def readings(data: Function | Brdf | Scattered, axes: Sequence[Array] = AXES) -> Scattered:
-    """List what is to be written, reading by reading.
-
-    Parameters
-    ----------
-    data : callable, Brdf or Scattered
-        A function is asked at every combination of `axes`; a grid is written node by node.
-    axes : sequence of three ndarray, deg
-        theta_i, theta_r and phi_r - phi_i.
-
-    Raises
-    ------
-    DomainError
-        If the function is no BRDF.
-    """
-    if isinstance(data, Scattered):
-        return data
-    grid = data if isinstance(data, Brdf) else Brdf.sampled(data, *axes)
-    phi_i = np.zeros(1) if grid.phi_i_deg is None else grid.phi_i_deg
-    nodes = np.meshgrid(grid.theta_i_deg, phi_i, grid.theta_r_deg, grid.phi_r_deg, indexing="ij")
-    return Scattered(
-        theta_i_deg=nodes[0].ravel(),
-        phi_i_deg=nodes[1].ravel(),
-        theta_r_deg=nodes[2].ravel(),
-        phi_r_deg=nodes[3].ravel(),
-        values=grid.values.reshape(-1, len(grid.channels)),
-        channels=grid.channels,
-        quantity=grid.quantity,
-        source=grid.source,
-        metadata=grid.metadata,
-    )
 
 
 def in_plane(data: Scattered, *, channel: str | None = None, tolerance_deg: float = 1e-6) -> Measurements:
@@ -279,12 +142,6 @@ def read_table(path: Path | str) -> Scattered:
     return Scattered(theta_i, phi_i, theta_r, phi_r, values=values, sigma=sigma, channels=channels, quantity=quantity, source=str(path))
 
 
-def require(path: Path | str, rows: Sequence[int], good: np.ndarray, problem: str) -> None:
-    """Raise a TableError with the line of the first reading that is not good."""
-    if not np.all(good):
-        raise TableError(path, problem, rows[int(np.flatnonzero(~good)[0])])
-
-
 def _columns(path: Path | str, line: int, names: list[str]) -> tuple[Quantity, tuple[str, ...], bool]:
     """What a header says: quantity, channels, and whether there are sigmas."""
     if len(set(names)) < len(names):
@@ -306,10 +163,3 @@ def _columns(path: Path | str, line: int, names: list[str]) -> tuple[Quantity, t
     if len(set(channels)) < len(channels) or (found["sigma"] and sorted(found["sigma"]) != sorted(channels)):
         raise TableError(path, f"sigma is given for {', '.join(found['sigma'])}, expected for each of {', '.join(channels)}", line)
     return kinds[0], channels, bool(found["sigma"])
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        return math.isfinite(float(cell)) and "_" not in cell
-    except ValueError:
-        return False

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from fitting.errors import DomainError
 from fitting.formats.grid import Array, Brdf, Function, ask
-from fitting.formats.table_csv import one_line, write_lines
+from fitting.formats.text import one_line, write_lines
 
 THETA_I = np.arange(0.0, 81, 10)
 AZIMUTH = np.arange(0.0, 181, 10)

@@ -172,7 +172,7 @@ def test_many_directions_at_once_and_one_by_one() -> None:
 
 def test_a_brdf_that_creates_light_is_refused_by_name() -> None:
     with pytest.raises(EnergyError, match=r"bright = 1 .*albedo of 1\.1"):
-        formed(dark=0.2 / math.pi, bright=1.1 / math.pi)
+        formed(dark=0.2 / math.pi, bright=1.1 / math.pi).alone("bright")
     table = formed(a=0.8 / math.pi, b=0.8 / math.pi)
     with pytest.raises(EnergyError, match=r"a = 1, b = 0\.5"):
         table.mixed({"a": 1, "b": 0.5})

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +15,7 @@ from hypothesis import strategies as st
 from fitting import DomainError, FitError, TableError
 from fitting.formats.grid import Brdf
 from fitting.formats.klems import BASES, read_klems, write_klems
+from tests.formats.radiance import ask_radiance
 
 QUARTER = "LBNL/Klems Quarter"
 Write = Callable[..., Path]
@@ -33,21 +32,6 @@ def forward(theta_i: Any, theta_r: Any, phi: Any) -> Any:
     """What goes through, strongest straight on."""
     i, r, p = map(np.radians, (theta_i, theta_r, phi))
     return 0.05 + 0.2 * np.maximum(-np.cos(i) * np.cos(r) - np.sin(i) * np.sin(r) * np.cos(p), 0) ** 5
-
-
-ASK = """
-import json, sys
-from pyradiance import bsdf
-loaded = bsdf.load_file(sys.argv[1])
-print(json.dumps([bsdf.query(loaded, *at)[1] for at in json.load(sys.stdin)]))
-"""
-
-
-def ask_radiance(path: Path, directions: Any) -> Any:
-    """What Radiance finds in a file, in a process of its own: its library may crash at a second file."""
-    asked = json.dumps(np.asarray(directions, float).tolist())
-    done = subprocess.run([sys.executable, "-c", ASK, path], input=asked, capture_output=True, text=True, check=True, timeout=90)
-    return np.array(json.loads(done.stdout))
 
 
 def test_mean_over_patches_keeps_the_energy(tmp_path: Path) -> None:

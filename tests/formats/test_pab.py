@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from hypothesis import strategies as st
 from fitting import DomainError, FitError, TableError
 from fitting.formats.grid import Brdf, Scattered
 from fitting.formats.pab import read_pab, write_pab
+from tests.formats.radiance import ask_radiance
 
 TEXT = """#sample_name "rose"
 #incident_angle 30 10
@@ -48,21 +47,6 @@ def lobes(theta_i: Any, theta_r: Any, phi: Any) -> Any:
     i, r, p = map(np.radians, (theta_i, theta_r, phi))
     along, across = np.cos(i) * np.cos(r), np.sin(i) * np.sin(r) * np.cos(p)
     return 0.1 + 0.2 * np.maximum(along - across, 0) ** 8 + 0.5 * np.maximum(along + across, 0) ** 8
-
-
-ASK = """
-import json, sys
-from pyradiance import bsdf
-loaded = bsdf.load_file(sys.argv[1])
-print(json.dumps([bsdf.query(loaded, *at)[1] for at in json.load(sys.stdin)]))
-"""
-
-
-def ask_radiance(path: Path, directions: Any) -> Any:
-    """What Radiance finds in a file, in a process of its own: its library may crash at a second file."""
-    asked = json.dumps(np.asarray(directions, float).tolist())
-    done = subprocess.run([sys.executable, "-c", ASK, path], input=asked, capture_output=True, text=True, check=True, timeout=90)
-    return np.array(json.loads(done.stdout))
 
 
 def test_hand_made_file(written: Write) -> None:

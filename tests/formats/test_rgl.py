@@ -19,16 +19,9 @@ from fitting.errors import DomainError, FitError, TableError
 from fitting.formats.grid import Brdf
 from fitting.formats.merl import read_merl, write_merl
 from fitting.formats.rgl import MAGIC, read_rgl, write_rgl
+from tests.formats.lobes import lobes
 
 SETTINGS = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-def lobes(theta_i: Any, theta_r: Any, phi: Any) -> Any:
-    """Reciprocal, and unlike in every channel: diffuse, towards the mirror, back to the light."""
-    i, r, p = (np.radians(a) for a in np.broadcast_arrays(theta_i, theta_r, phi))
-    across = np.sin(i) * np.sin(r) * np.cos(p)
-    mirror, back = np.cos(i) * np.cos(r) - across, np.cos(i) * np.cos(r) + across
-    return np.stack([np.full(i.shape, 0.3 / np.pi), 0.1 + 0.2 * np.maximum(mirror, 0) ** 20, 0.1 + 0.1 * np.maximum(back, 0) ** 10], -1)
 
 
 def grey(theta_i: Any, theta_r: Any, phi: Any) -> Any:
