@@ -48,12 +48,12 @@ def draw_petal(path: str | Path, mesh: TriangleMesh, petal: Petal, *, name: str,
         front.plot(*point[:2], mark, color="red", label=label)
         local = (point - petal.T_scan_petal[:3, 3]) @ petal.T_scan_petal[:3, :3]
         side.plot(*local[1:], mark, color="red", label=label)
-    front.legend(fontsize="small")
+    front.legend(loc="upper right", fontsize="small")
     measured = (petal.midrib - petal.T_scan_petal[:3, 3]) @ petal.T_scan_petal[:3, :3]
     side.plot(measured[:, 1], measured[:, 2], ".", color="grey", markersize=2, label="midrib")
     side.plot(*petal.profile.T, color="black", linewidth=1, label="smooth")
     side.set(xlabel="from base to tip, mm", ylabel="towards the inner face, mm", aspect="equal", title="midrib from the side")
     side.set_adjustable("datalim")
-    side.legend(fontsize="small")
+    side.legend(loc="upper right", fontsize="small")
     figure.suptitle(f"{name}, {petal.area:.0f} mm²" + (" (SIMULATED)" if simulated else ""))
     figure.savefig(path, dpi=110)
