@@ -1,4 +1,4 @@
-"""From readings to reflectance: the micro-structure model of a petal and the mixture that explains its readings.
+"""From readings to reflectance: the micro-structure model of a petal and the models that explain its readings.
 
 Names are loaded when first asked for, so that `import fitting` stays quick.
 """
@@ -9,11 +9,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from fitting.aperture import Aperture
     from fitting.body import BodyTrace, Epidermis, trace_body
     from fitting.cells import CELL_AREA, Cell, Spread
+    from fitting.compare import Comparison
     from fitting.errors import DomainError, EnergyError, FitError, ReadingError, TableError
+    from fitting.fit import Fit, Prediction, fit_joint
+    from fitting.ladder import RUNGS
+    from fitting.linear import LinearFit, fit_linear, mixture_from
     from fitting.measurements import Measurements, read_csv
-    from fitting.mixture import MixtureFit, fit_mixture
     from fitting.model import Model
     from fitting.orders import EscapeOrders, escape_orders
     from fitting.paper import TERMS, Quadrature, paper_terms
@@ -23,21 +27,28 @@ if TYPE_CHECKING:
     from fitting.table import Grid, ReflectanceTable, paper_table, radiometric_table
 
 _HOME = {
+    "Aperture": "aperture",
     "BodyTrace": "body",
     "Epidermis": "body",
     "trace_body": "body",
     "CELL_AREA": "cells",
     "Cell": "cells",
     "Spread": "cells",
+    "Comparison": "compare",
     "DomainError": "errors",
     "EnergyError": "errors",
     "FitError": "errors",
     "ReadingError": "errors",
     "TableError": "errors",
+    "Fit": "fit",
+    "Prediction": "fit",
+    "fit_joint": "fit",
+    "RUNGS": "ladder",
+    "LinearFit": "linear",
+    "fit_linear": "linear",
+    "mixture_from": "linear",
     "Measurements": "measurements",
     "read_csv": "measurements",
-    "MixtureFit": "mixture",
-    "fit_mixture": "mixture",
     "Model": "model",
     "EscapeOrders": "orders",
     "escape_orders": "orders",
@@ -58,18 +69,23 @@ _HOME = {
 
 __all__ = [
     "CELL_AREA",
+    "RUNGS",
     "TERMS",
+    "Aperture",
     "BodyTrace",
     "Cell",
+    "Comparison",
     "DomainError",
     "EnergyError",
     "Epidermis",
     "EscapeOrders",
+    "Fit",
     "FitError",
     "Grid",
+    "LinearFit",
     "Measurements",
-    "MixtureFit",
     "Model",
+    "Prediction",
     "Quadrature",
     "ReadingError",
     "Reflectance",
@@ -80,7 +96,9 @@ __all__ = [
     "TableError",
     "basis_tables",
     "escape_orders",
-    "fit_mixture",
+    "fit_joint",
+    "fit_linear",
+    "mixture_from",
     "paper_table",
     "paper_terms",
     "paper_terms_any",

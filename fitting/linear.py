@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from itertools import combinations
 from typing import Any, Literal
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fitting.errors import FitError, ReadingError
-from fitting.paper import TERMS, paper_terms
+from fitting.paper import TERMS
 
 Weights = Literal["relative", "plain", "sigma", "covariance"]
 Array = NDArray[np.float64]
@@ -126,7 +126,7 @@ class LinearFit:
     """
 
     coefficients: tuple[Coefficient, ...]
-    weights: str
+    weights: Weights
     measured: Array
     modelled: Array
     E: MaskedArray
@@ -218,7 +218,7 @@ class LinearFit:
         Parameters
         ----------
         unit : array_like, shape (c,)
-            Reflectance of each term with coefficient 1, such as `unit_reflectances` gives for the paper's.
+            Reflectance of each term with coefficient 1, as `fitting.ladder.unit_reflectances` gives.
         white : float
             Reading of the perfect diffuser at normal incidence in the unit of the values; 1 for reflectance factors and for BRDF, as
             `Measurements.intensity` converts them.
@@ -271,6 +271,33 @@ class LinearFit:
             "statement": self.statement,
         }
 
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> LinearFit:
+        """Rebuild a fit from `to_dict`.
+
+        Raises
+        ------
+        FitError
+            If an entry is missing or of the wrong kind.
+        """
+        try:
+            values: dict[str, Any] = {field.name: stored[field.name] for field in fields(cls)}
+            values["coefficients"] = tuple(_coefficient(c) for c in values["coefficients"])
+            values |= {name: np.array(values[name], float) for name in ("measured", "modelled", "correlation")}
+            values["E"] = np.ma.masked_invalid(np.array(values["E"], float))
+            values["condition"] = math.inf if values["condition"] is None else float(values["condition"])
+            values["groups"] = tuple(tuple(group) for group in values["groups"])
+        except KeyError as error:
+            raise FitError(f"a stored fit lacks {error}; it was perhaps written by something else") from error
+        except (TypeError, ValueError) as error:
+            raise FitError(f"a stored fit cannot be read: {error}") from error
+        return cls(**values)
+
+
+def _coefficient(stored: Mapping[str, Any]) -> Coefficient:
+    unbounded = {name: math.inf for name in ("standard_error", "high") if stored[name] is None}
+    return Coefficient(**{**stored, **unbounded})
+
 
 def fit_linear(
     terms: ArrayLike,
@@ -279,6 +306,7 @@ def fit_linear(
     covariance: ArrayLike | None = None,
     weights: Weights = "relative",
     names: Sequence[str] = TERMS,
+    tangents: ArrayLike | None = None,
     theta_r_deg: ArrayLike | None = None,
     source: str = "readings",
     rows: ArrayLike | None = None,
@@ -298,6 +326,9 @@ def fit_linear(
         readings that happen to be low: with noise of a fraction f the coefficients come out low by about f^2.
     names : sequence of str
         Of the columns.
+    tangents : array_like, shape (n, q), optional
+        How the fitted values change with numbers that were found from the same readings, such as a shape. These may change too, either
+        way: it widens the intervals, takes q degrees of freedom, and changes the coefficients only as far as those numbers were not best.
     theta_r_deg : array_like, shape (n,), optional, deg
         Views, for the cosine-weighted error.
     source : str
@@ -319,9 +350,7 @@ def fit_linear(
         If the shapes do not match, there are no readings, no term acts on any of them, or there is no covariance to weigh by.
     """
     design, target, views, lines, names = _checked(terms, values, theta_r_deg, source, rows, names)
-    noise = None if covariance is None else _checked_covariance(covariance, len(target), source, lines)
-    root = None if noise is None else _cholesky(noise, source, lines)
-    _require_light(target, noise, weights, source, lines)
+    noise, root, whiten = _weighing(target, covariance, weights, source, lines)
     size = np.abs(design).max(axis=0)
     present = size > NEGLIGIBLE * size.max()
     if not present.any():
@@ -329,15 +358,19 @@ def fit_linear(
             f"{source}: every term is 0 at every reading, so no coefficient can be found: choose readings where the model is not 0"
         )
 
-    whiten = _whitener(weights, target, noise, root, source)
     weighted, aim = whiten(design[:, present]), whiten(target[:, None])[:, 0]
     length = np.linalg.norm(weighted, axis=0)
-    u, singular, v = _seen(weighted / length)
+    weighted /= length
+    traded = 0
+    if tangents is not None:
+        along = _directions(whiten(_checked_tangents(tangents, len(target), source)))
+        weighted, aim, traded = weighted - along @ (along.T @ weighted), aim - along @ (along.T @ aim), along.shape[1]
+    u, singular, v = _seen(weighted)
     x, gradient = _non_negative(singular[:, None] * v, u.T @ aim, source)
     modelled = design[:, present] @ (x / length)
     sum_of_squares = float(np.sum((whiten((target - modelled)[:, None])) ** 2))
 
-    dof = len(target) - int(np.sum(x > 0))
+    dof = max(0, len(target) - int(np.sum(x > 0)) - traded)
     scale = math.sqrt(sum_of_squares / dof) if dof > 0 else None
     spread = _spread(u, weights, whiten, noise)
     level = 1.0 if noise is not None else math.inf if scale is None else scale
@@ -369,7 +402,7 @@ def fit_linear(
         Coefficient, value=0.0, standard_error=math.inf, low=0.0, high=math.inf, active=False, multiplier=0.0, determined=False
     )
     coefficients = tuple(spelt(name, int(i)) if here else absent(name) for name, here, i in zip(names, present, place, strict=True))
-    smallest = np.linalg.svd(weighted / length, compute_uv=False)
+    smallest = np.linalg.svd(weighted, compute_uv=False)
     full = bool(present.all()) and len(smallest) == len(names) and smallest[-1] > 0
     percent = np.ma.masked_where(target <= 0, 100 * np.abs(target - modelled) / np.where(target > 0, target, 1.0))
     return LinearFit(
@@ -391,31 +424,20 @@ def fit_linear(
     )
 
 
-def unit_reflectances(*, aspect: float, n_us: float = 40.0, n_ss: float = 5.0, nodes: int = 32) -> Array:
-    """Reflectance of each of the paper's terms with coefficient 1, at normal incidence into the hemisphere.
+def weighing(
+    values: ArrayLike,
+    *,
+    covariance: ArrayLike | None = None,
+    weights: Weights = "relative",
+    source: str = "readings",
+    rows: ArrayLike | None = None,
+) -> Callable[[Array], Array]:
+    """Return what multiplies residuals before `fit_linear` squares them, as a function of columns of shape (n, c).
 
-    Readings on the scale of `Measurements.intensity` are pi f_r cos(theta_i), so the reflectance is the integral of r'(0, theta) over
-    sin^2(theta): 1 for s_diff, 2 / (n_ss + 2) for s_spec.
-
-    Parameters
-    ----------
-    aspect, n_us, n_ss : float
-        Of the cells and lobes, as in `paper_terms`.
-    nodes : int
-        Gauss-Legendre nodes over sin^2(theta).
-
-    Returns
-    -------
-    ndarray, shape (4,), 1/1
-
-    Raises
-    ------
-    DomainError
-        If the cell shape or an exponent is outside the model.
+    Parameters and errors are those of `fit_linear`.
     """
-    z, w = np.polynomial.legendre.leggauss(nodes)
-    terms = paper_terms(0.0, np.degrees(np.arcsin(np.sqrt((z + 1) / 2))), aspect=aspect, n_us=n_us, n_ss=n_ss)
-    return w / 2 @ terms
+    _, target, _, lines, _ = _checked(np.ones((np.size(values), 1)), values, None, source, rows, ("",))
+    return _weighing(target, covariance, weights, source, lines)[2]
 
 
 Range = tuple[float, float]
@@ -536,7 +558,7 @@ def _checked(
     for what, column in (("theta_r", views), ("rows", lines)):
         if column is not None and column.shape != target.shape:
             raise FitError(f"{source}: {what} has shape {column.shape}, expected {target.shape}")
-    for what, column in (("the reading", target), ("a term", design.sum(axis=1)), ("theta_r", views)):
+    for what, column in (("the reading", target), ("a term", np.where(np.isfinite(design).all(axis=1), 0.0, math.nan)), ("theta_r", views)):
         if column is not None and not np.all(good := np.isfinite(column)):
             first = int(np.flatnonzero(~good)[0])
             raise ReadingError(source, int(lines[first]), f"{what} is not a finite number: leave the row out or mend it")
@@ -599,6 +621,16 @@ def _require_light(target: Array, noise: Array | None, weights: str, source: str
         raise ReadingError(source, int(rows[first]), problem)
 
 
+def _weighing(
+    target: Array, covariance: ArrayLike | None, weights: str, source: str, rows: NDArray[np.int64]
+) -> tuple[Array | None, Array | None, _Scaled | _Rooted]:
+    """Covariance, its root and the weights, all checked."""
+    noise = None if covariance is None else _checked_covariance(covariance, len(target), source, rows)
+    root = None if noise is None else _cholesky(noise, source, rows)
+    _require_light(target, noise, weights, source, rows)
+    return noise, root, _whitener(weights, target, noise, root, source)
+
+
 class _Scaled:
     """Multiplies the rows of a matrix."""
 
@@ -629,6 +661,20 @@ def _whitener(weights: str, target: Array, noise: Array | None, root: Array | No
     if noise is None or root is None:
         raise FitError(f"{source}: there is no covariance to weigh by: give one or use other weights")
     return _Rooted(root) if weights == "covariance" else _Scaled(1 / np.sqrt(np.diag(noise)))
+
+
+def _checked_tangents(tangents: ArrayLike, n: int, source: str) -> Array:
+    found = np.array(tangents, float)
+    if found.ndim != 2 or len(found) != n or not np.all(np.isfinite(found)):
+        raise FitError(f"{source}: tangents must be finite and of shape ({n}, q), a row a reading, not {found.shape}")
+    return found
+
+
+def _directions(columns: Array) -> Array:
+    """Unit vectors that span some columns."""
+    length = np.linalg.norm(columns, axis=0)
+    u, singular, _ = np.linalg.svd(columns[:, length > 0] / length[length > 0], full_matrices=False)
+    return u[:, singular > RANK_TOLERANCE * singular.max(initial=0.0)]
 
 
 def _seen(design: Array) -> tuple[Array, Array, Array]:

@@ -1,22 +1,23 @@
-"""Readings in the plane of incidence, and the tables they come from."""
+"""Readings of reflected light, and the tables they come from."""
 
 from __future__ import annotations
 
 import csv
 import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fitting.errors import FitError, ReadingError, TableError
 
 Quantity = Literal["intensity", "reflectance-factor", "brdf"]
 Array = NDArray[np.float64]
+QUANTITIES: tuple[Quantity, ...] = ("intensity", "reflectance-factor", "brdf")
 
 UNITS: Mapping[str, str] = {"intensity": "relative", "reflectance-factor": "1", "brdf": "1/sr"}
 """Quantities a reading may have, with the unit a table is taken to be in unless another is named."""
@@ -24,7 +25,21 @@ UNITS: Mapping[str, str] = {"intensity": "relative", "reflectance-factor": "1", 
 MIN_READINGS = 4
 """The mixture has four coefficients."""
 
-# Column names understood without being told, in small letters, with the unit's suffix taken off (see _plain).
+INCIDENCE_STEP_DEG = 0.5
+"""Incidences read back within this are one."""
+
+PHI_TOLERANCE_DEG = 1e-6
+"""An azimuth this near to 0 or 180 deg is in the plane of incidence: differences of azimuths are rounded."""
+
+SIGMA_TOLERANCE = 1e-6
+"""How far, relatively, a sigma may be from the root of its covariance's diagonal."""
+
+NOISE = 5.0
+"""A reading may lie this many standard uncertainties below 0 before it is an error and not noise."""
+
+Repeats = Literal["refuse", "keep", "mean"]
+
+# Column names understood without being told, in small letters, with the unit taken off (see _split).
 ALIASES: Mapping[str, frozenset[str]] = {
     "theta_i": frozenset({"theta_i", "thetai", "theta_l", "theta_light", "incidence", "incidence_angle"}),
     "theta_r": frozenset({"theta_r", "thetar", "theta_v", "thetav", "theta_o", "theta_view", "theta", "view", "view_angle"}),
@@ -32,12 +47,38 @@ ALIASES: Mapping[str, frozenset[str]] = {
     "reflectance-factor": frozenset({"brf", "reflectance", "reflectance_factor", "rho"}),
     "brdf": frozenset({"brdf", "fr", "f_r"}),
     "sigma": frozenset({"sigma", "u", "std", "sd", "stdev", "uncertainty", "u_value", "sigma_value", "value_sigma", "value_u"}),
+    "phi": frozenset({"phi", "dphi", "delta_phi", "phi_rel", "relative_azimuth"}),
+    "phi_i": frozenset({"phi_i", "phii", "phi_l", "phi_light"}),
+    "phi_r": frozenset({"phi_r", "phir", "phi_v", "phiv", "phi_o", "phi_view"}),
 }
+
+ANGLES = ("theta_i", "theta_r", "phi", "phi_i", "phi_r")
+NEEDED = ("theta_i", "theta_r", "value")
+ROLES = (*NEEDED, "sigma", "phi", "phi_i", "phi_r")
+
+# How units are spelt, in small letters.
+UNIT_SPELLINGS: Mapping[str, str] = {
+    **dict.fromkeys(("deg", "degree", "degrees", "°"), "deg"),
+    **dict.fromkeys(("rad", "radian", "radians"), "rad"),
+    **dict.fromkeys(("1/sr", "/sr", "sr-1", "sr^-1", "sr**-1", "sr⁻¹", "1_sr", "sr_1", "per_sr", "per sr"), "1/sr"),
+    **dict.fromkeys(("%", "percent", "pct"), "%"),
+    **dict.fromkeys(("1", "-", "dimensionless", "unitless"), "1"),
+}
+# Those a name may end in after an underscore; the others need brackets.
+UNIT_SUFFIX = re.compile(r"(.+)_(deg|degrees|rad|radians|1_sr|sr_1|per_sr|percent|pct)")
+
+LONGEST_LINE = 1 << 16
+"""Characters; what is longer is no line of a table."""
+
+Said = list[tuple[str, int | None]]
+"""Units of one column, and the line that names each."""
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """Readings of reflected light in the plane of incidence.
+    """Readings of reflected light.
+
+    In the plane of incidence the side is said by theta_r's sign and phi is 0; out of it theta_r is 0 or more and phi is not 0.
 
     Parameters
     ----------
@@ -46,7 +87,7 @@ class Measurements:
     value : ndarray, shape (n,)
         Readings.
     sigma : ndarray, shape (n,), optional
-        Standard uncertainty of `value`, in its unit.
+        Standard uncertainty of `value`, in its unit; by default the root of the covariance's diagonal.
     quantity : {"intensity", "reflectance-factor", "brdf"}
         What `value` is: radiance under a constant beam (any unit), pi f_r, or f_r.
     unit : str
@@ -55,13 +96,19 @@ class Measurements:
         Where the readings come from, for messages.
     rows : ndarray of int, shape (n,), optional
         Line of each reading in its source; by default 1, 2, ...
+    phi_deg : ndarray, shape (n,), optional, deg
+        phi_r - phi_i, -180 to 180, 0 on the light's side; by default 0. Readings at +-180 become readings in the plane with theta_r
+        turned negative, and those along the normal, where azimuth means nothing, get 0.
+    covariance : ndarray, shape (n, n), optional
+        Of `value`, in its unit squared. Whether it is positive definite is for the fit to say.
 
     Raises
     ------
     ReadingError
-        If a number is not finite, an angle is out of range or a sigma is negative.
+        If a number is not finite, an angle is out of range, theta_r is below 0 out of the plane, a sigma is negative or not that of the
+        covariance, or the covariance is not symmetric.
     FitError
-        If lengths differ or the quantity is unknown.
+        If shapes do not match or the quantity is unknown.
     """
 
     theta_i_deg: Array
@@ -71,7 +118,9 @@ class Measurements:
     quantity: Quantity = "intensity"
     unit: str = ""
     source: str = "readings"
-    rows: NDArray[np.int64] | None = None
+    rows: NDArray[np.int64] = None  # type: ignore[assignment]  # an array once made
+    phi_deg: Array = field(default=None, kw_only=True)  # type: ignore[arg-type]  # an array once made
+    covariance: Array | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.quantity not in UNITS:
@@ -79,9 +128,11 @@ class Measurements:
         rows = _column(np.arange(1, np.size(self.value) + 1) if self.rows is None else self.rows, "rows", self.source, np.int64)
         object.__setattr__(self, "rows", rows)
         object.__setattr__(self, "unit", self.unit or UNITS[self.quantity])
-        for name in ("theta_i_deg", "theta_r_deg", "value", "sigma"):
+        if self.phi_deg is None:
+            object.__setattr__(self, "phi_deg", np.zeros(rows.size))
+        for name in ("theta_i_deg", "theta_r_deg", "phi_deg", "value", "sigma"):
             given = getattr(self, name)
-            if given is None and name == "sigma":
+            if given is None:
                 continue
             column = _column(given, name, self.source, np.float64)
             object.__setattr__(self, name, column)
@@ -90,8 +141,39 @@ class Measurements:
             self._require(np.isfinite(column), name, column, "a finite number")
         self._require((self.theta_i_deg >= 0) & (self.theta_i_deg < 90), "theta_i", self.theta_i_deg, "0 <= theta_i < 90 deg")
         self._require(np.abs(self.theta_r_deg) <= 180, "theta_r", self.theta_r_deg, "-180 <= theta_r <= 180 deg")
+        self._lay_into_plane()
         if self.sigma is not None:
             self._require(self.sigma >= 0, "sigma", self.sigma, "0 or more")
+        if self.covariance is not None:
+            self._take_sigma_from(self.covariance)
+
+    def _lay_into_plane(self) -> None:
+        """Give each direction one name: a signed theta_r in the plane of incidence, a theta_r from 0 up out of it."""
+        theta_r, phi = self.theta_r_deg, self.phi_deg
+        self._require(np.abs(phi) <= 180, "phi", phi, "-180 <= phi <= 180 deg")
+        light = (np.abs(phi) <= PHI_TOLERANCE_DEG) | (theta_r == 0) | (np.abs(theta_r) == 180)
+        self._require(light | (theta_r > 0), "theta_r", theta_r, "0 or more where phi is not 0: the side is said by one of the two")
+        forward = ~light & (180 - np.abs(phi) <= PHI_TOLERANCE_DEG)
+        object.__setattr__(self, "theta_r_deg", _frozen(np.where(forward, -theta_r, theta_r)))
+        object.__setattr__(self, "phi_deg", _frozen(np.where(light | forward, 0.0, phi)))
+
+    def _take_sigma_from(self, given: object) -> None:
+        covariance = _column(given, "covariance", self.source, np.float64, ndim=2)
+        if covariance.shape != (len(self), len(self)):
+            raise FitError(f"{self.source}: the covariance has shape {covariance.shape}, expected {(len(self), len(self))}")
+        variance = covariance.diagonal()
+        self._require(np.isfinite(variance) & (variance >= 0), "variance", variance, "a finite number, 0 or more")
+        sigma = np.sqrt(variance)
+        with np.errstate(over="ignore", invalid="ignore"):
+            good = np.abs(covariance - covariance.T) <= 1e-9 * sigma[:, None] * sigma  # False for NaN
+        if not good.all():
+            first, second = (int(k) for k in np.argwhere(~good)[0])
+            raise self.error(first, f"its covariance with row {self.rows[second]} is not finite or not symmetric")
+        if self.sigma is not None:
+            agreed = np.abs(self.sigma - sigma) <= SIGMA_TOLERANCE * sigma
+            self._require(agreed, "sigma", self.sigma, "the root of its variance in the covariance")
+        object.__setattr__(self, "covariance", covariance)
+        object.__setattr__(self, "sigma", _frozen(sigma))
 
     def __len__(self) -> int:
         return self.value.size
@@ -103,8 +185,63 @@ class Measurements:
 
     def error(self, index: int, problem: str) -> ReadingError:
         """Return an error that names reading `index` (from 0) by its source and row."""
-        assert self.rows is not None  # set in __post_init__
         return ReadingError(self.source, int(self.rows[index]), problem)
+
+    def take(self, kept: ArrayLike) -> Measurements:
+        """Return some of the readings, with their rows and their part of the covariance.
+
+        Parameters
+        ----------
+        kept : array_like of bool, shape (n,), or of int
+            A mask, or which readings, from 0, in the order wanted.
+
+        Returns
+        -------
+        Measurements
+
+        Raises
+        ------
+        FitError
+            If a mask is not as long as the readings, or there is no reading of an index.
+        """
+        try:
+            chosen = np.atleast_1d(np.arange(len(self))[np.asarray(kept)])
+        except IndexError as error:
+            raise FitError(f"{self.source}: of {len(self)} readings those cannot be taken: {error}") from error
+        return replace(
+            self,
+            theta_i_deg=self.theta_i_deg[chosen],
+            theta_r_deg=self.theta_r_deg[chosen],
+            value=self.value[chosen],
+            sigma=None if self.sigma is None else self.sigma[chosen],
+            rows=self.rows[chosen],
+            phi_deg=self.phi_deg[chosen],
+            covariance=None if self.covariance is None else self.covariance[np.ix_(chosen, chosen)],
+        )
+
+    @property
+    def in_plane(self) -> NDArray[np.bool_]:
+        """Which readings are in the plane of incidence, shape (n,)."""
+        return self.phi_deg == 0
+
+    @property
+    def incidences(self) -> Array:
+        """Distinct theta_i, ndarray of shape (k,), deg, rising.
+
+        Readbacks no more than `INCIDENCE_STEP_DEG` above the lowest of a group count as one: their mean, to a thousandth.
+        """
+        return np.round(np.bincount(self.incidence_of, self.theta_i_deg) / np.bincount(self.incidence_of), 3)
+
+    @property
+    def incidence_of(self) -> NDArray[np.int64]:
+        """Which of `incidences` each reading belongs to, shape (n,)."""
+        distinct, which = np.unique(self.theta_i_deg, return_inverse=True)
+        group = np.zeros(distinct.size, dtype=np.int64)
+        first = 0
+        while first < distinct.size:
+            group[first:] += first > 0
+            first = int(np.searchsorted(distinct, distinct[first] + INCIDENCE_STEP_DEG, side="right"))
+        return group[which]
 
     @property
     def _per_intensity(self) -> Array:
@@ -127,6 +264,18 @@ class Measurements:
         """Standard uncertainty of `intensity`, or None."""
         return None if self.sigma is None else self.sigma * self._per_intensity
 
+    @property
+    def intensity_covariance(self) -> Array | None:
+        """Covariance of `intensity`, ndarray of shape (n, n): from `covariance`, else from `sigma` as a diagonal, else None."""
+        if self.covariance is not None:
+            return self.covariance * self._per_intensity[:, None] * self._per_intensity
+        return None if self.intensity_sigma is None else np.diag(self.intensity_sigma**2)
+
+
+def wrapped(phi_deg: Array) -> Array:
+    """Bring azimuths to -180 to 180 deg; those that are there already stay as they are, to the last digit."""
+    return np.where(np.abs(phi_deg) <= 180, phi_deg, np.remainder(phi_deg + 180, 360) - 180)
+
 
 def read_csv(
     path: Path | str,
@@ -136,26 +285,40 @@ def read_csv(
     theta_r_positive: Literal["light", "forward"] = "light",
     quantity: Quantity | None = None,
     unit: str = "",
+    repeats: Repeats = "refuse",
+    covariance: Path | str | None = None,
 ) -> Measurements:
     """Read readings from a comma-separated table with a header line.
 
     Blank lines and lines that begin with '#' are passed over. Nothing else is: a chosen row that cannot be used is an error.
+
+    Units may stand in the header ("theta_r [deg]", "theta_r_deg", "brdf_per_sr", "brf [%]"), in a line right below it (",deg,deg,1/sr") or
+    in a column named "unit". Angles are in degrees, a BRDF in 1/sr, a reflectance factor in 1 or in %, which is divided by 100; what says
+    otherwise, or is said twice in two ways, is an error.
 
     Parameters
     ----------
     path : Path or str
         The file, UTF-8.
     columns : mapping, optional
-        Which column holds "theta_i", "theta_r", "value" and, if there is one, "sigma". A number instead of a name stands for a constant,
-        such as the incidence of the whole table. Those not given are found by their usual names (`ALIASES`), a unit's suffix aside.
+        Which column holds "theta_i", "theta_r", "value" and, where there are such, "sigma" and "phi", or "phi_i" and "phi_r". A number
+        instead of a name stands for a constant, such as the incidence of the whole table. Those not given are found by their usual names
+        (`ALIASES`), a unit's suffix aside.
     where : mapping, optional
         Rows to use: column and the value it must have. Numbers match within 1e-9, text exactly.
     theta_r_positive : {"light", "forward"}
-        On which side of the normal the table counts theta_r positive. Here it is the light's side; "forward" is turned round.
+        On which side of the normal the table counts theta_r positive and phi 0. Here it is the light's side; "forward" is turned round.
     quantity : {"intensity", "reflectance-factor", "brdf"}, optional
         What the values are. By default the column's name says it (BRF, BRDF, ...), and any other name means intensity.
     unit : str, optional
         Label of the unit.
+    repeats : {"refuse", "keep", "mean"}
+        What becomes of several readings at the same angles (to a millionth of a degree): an error; readings each; or their mean, named by
+        the line of the first. The mean's uncertainty follows from the table's sigma, taken as independent, or its covariance; if it has
+        neither, from the scatter, provided that everything was repeated.
+    covariance : Path or str, optional
+        A second file, n rows of n numbers separated by commas and no header: the covariance of the table's n rows, in their order, in the
+        value's unit squared. Rows that are not chosen are left out of it.
 
     Returns
     -------
@@ -164,119 +327,341 @@ def read_csv(
     Raises
     ------
     TableError
-        With file and line, if the file cannot be read, a column is missing or ambiguous, a cell is not a finite number, or fewer than four
-        rows are left.
+        With file and line, if a file cannot be read or is cut short, a column is missing or ambiguous, a unit contradicts the quantity, a
+        cell is not a finite number, a reading cannot be light (0 or less without a sigma, or 5 sigma below 0), angles come twice, or
+        fewer than four readings are left.
     """
     path = Path(path)
     if theta_r_positive not in ("light", "forward"):
         raise FitError(f"theta_r_positive is 'light' or 'forward', not {theta_r_positive!r}")
-    table = _lines(path)
-    header_line, names = next(table, (0, []))
-    if not names:
-        raise TableError(path, "no header line found; expected one naming the columns")
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise TableError(path, f"column {', '.join(twice)} appears twice in the header", header_line)
-    roles = {role: _find(path, header_line, names, role, (columns or {}).get(role)) for role in ("theta_i", "theta_r", "value", "sigma")}
-    if unknown := sorted(set(columns or {}) - set(roles)):
-        raise TableError(path, f"no such role: {', '.join(unknown)}; columns may be given for {', '.join(roles)}")
+    if repeats not in ("refuse", "keep", "mean"):
+        raise FitError(f"repeats is 'refuse', 'keep' or 'mean', not {repeats!r}")
+    lines = _lines(path)
+    header_line, names, _ = next(lines, (0, [], True))
+    _require_names(path, header_line, names)
+    roles = _roles(path, header_line, names, columns or {})
     for name in where or {}:
         if name not in names:
-            raise TableError(path, f"no column {name!r} to choose rows by; there are {', '.join(names)}", header_line)
+            raise TableError(path, f"no column {name!r} to choose rows by; there are {_some(names)}", header_line)
+    rows = _rows(path, names, lines)
+    named: dict[str, str] = {role: name for role, name in roles.items() if isinstance(name, str)}
+    units: dict[str, Said] = {role: [(unit, header_line) for unit in _split(name)[1]] for role, name in named.items()}
+    if rows and _names_units(rows[0][1], named):
+        line, row = rows.pop(0)
+        for role, name in named.items():
+            units[role] += [(_unit(row[name]), line)] if row[name] else []
+    kept = [k for k, (_, row) in enumerate(rows) if all(_same(row[name], wanted) for name, wanted in (where or {}).items())]
+    _require_rows(path, len(kept), where or {}, {name: {row[name] for _, row in rows} for name in where or {}})
+    chosen = [rows[k] for k in kept]
+    _require_degrees(path, named, units)
+    of_value = units.get("value", []) + _unit_column(path, names, chosen)
+    if _unit(unit) in UNIT_SPELLINGS.values():
+        of_value.append((_unit(unit), None))
+    kind, said = _quantity(path, named.get("value", "value"), quantity, of_value)
+    _require_one_unit(path, units.get("sigma", []), said or unit or UNITS[kind])
+    percent = kind == "reflectance-factor" and said == "%"
+    divisor = 100.0 if percent else 1.0
 
-    chosen: list[tuple[int, dict[str, str]]] = []
-    seen: dict[str, set[str]] = {name: set() for name in where or {}}
-    for line, cells in table:
-        if len(cells) != len(names):
-            raise TableError(path, f"{len(cells)} cells, expected {len(names)} as in the header", line)
-        row = dict(zip(names, cells, strict=True))
-        for name, values in seen.items():
-            values.add(row[name])
-        if all(_same(row[name], wanted) for name, wanted in (where or {}).items()):
-            chosen.append((line, row))
-    _require_rows(path, len(chosen), where or {}, seen)
-
-    def column(role: str) -> Array:
+    def column(role: str) -> Array | None:
         name = roles[role]
         if isinstance(name, str):
             return np.array([_number(path, line, name, row[name]) for line, row in chosen])
-        return np.full(len(chosen), name, dtype=float)
+        return None if name is None else np.full(len(chosen), name, dtype=float)
 
-    value_name = roles["value"]
-    named = next((q for q in UNITS if isinstance(value_name, str) and _plain(value_name) in ALIASES[q]), "intensity")
+    read = {role: values for role in ROLES if (values := column(role)) is not None}
+    spread = None if covariance is None else _matrix(Path(covariance), len(rows), path)[np.ix_(kept, kept)] / divisor**2
     try:
-        return Measurements(
-            theta_i_deg=column("theta_i"),
-            theta_r_deg=column("theta_r") if theta_r_positive == "light" else 0.0 - column("theta_r"),
-            value=column("value"),
-            sigma=None if roles["sigma"] is None else column("sigma"),
-            quantity=quantity or named,  # type: ignore[arg-type]  # a key of UNITS
-            unit=unit,
+        found = Measurements(
+            theta_i_deg=read["theta_i"],
+            theta_r_deg=read["theta_r"],
+            value=read["value"] / divisor,
+            sigma=read["sigma"] / divisor if "sigma" in read else None,
+            quantity=kind,
+            unit="1, from %" if percent else unit or said,
             source=str(path),
             rows=np.array([line for line, _ in chosen]),
+            phi_deg=_azimuth(path, read, [line for line, _ in chosen]),
+            covariance=spread,
         )
+        found = _without_repeats(_turned(found) if theta_r_positive == "forward" else found, repeats)
+        _require_light(found)
     except ReadingError as error:
         raise TableError(path, error.problem, error.row) from error
+    _require_rows(path, len(found), where or {}, {})
+    return found
 
 
-def _column(values: object, name: str, source: str, dtype: type[np.generic]) -> NDArray[Any]:
-    """Copy to a read-only vector, so that a frozen table stays what it was when it was checked."""
+def _column(values: object, name: str, source: str, dtype: type[np.generic], ndim: int = 1) -> NDArray[Any]:
+    """Copy to a read-only array, so that a frozen table stays what it was when it was checked."""
     try:
         column = np.array(values, dtype=dtype)
     except (TypeError, ValueError) as error:
         raise FitError(f"{source}: {name} must be numbers: {error}") from error
-    if column.ndim != 1:
-        raise FitError(f"{source}: {name} must be one column of numbers, not of shape {column.shape}")
+    if column.ndim != ndim:
+        raise FitError(f"{source}: {name} must be one {'column' if ndim == 1 else 'matrix'} of numbers, not of shape {column.shape}")
+    return _frozen(column)
+
+
+def _frozen(column: NDArray[Any]) -> NDArray[Any]:
     column.flags.writeable = False
     return column
 
 
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and stripped cells of all lines but comments and blank ones."""
+def _lines(path: Path) -> Iterator[tuple[int, list[str], bool]]:
+    """Yield number, stripped cells and whether it ended in a line break, of all lines but comments and blank ones."""
+    ended = True
+
+    def text() -> Iterator[str]:
+        nonlocal ended
+        offset = 0
+        with path.open(encoding="utf-8", errors="surrogateescape", newline="") as file:
+            for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), ""), 1):
+                if bad := re.search("[\0\udc80-\udcff]", line):
+                    at = offset + len(line[: bad.start()].encode())
+                    kind = "is not text" if bad[0] == "\0" else "is not UTF-8 text"
+                    raise TableError(path, f"{kind}: byte {ord(bad[0]) & 0xFF:#04x} at offset {at}; save it as UTF-8 CSV", number)
+                if len(line) >= LONGEST_LINE:
+                    raise TableError(path, f"is not a table: the line from offset {offset} on is longer than {LONGEST_LINE}", number)
+                offset += len(line.encode())
+                ended = line[-1] in "\r\n"
+                line = line.removeprefix("\ufeff") if number == 1 else line
+                yield "\n" if line.lstrip().startswith("#") else line  # a comment's quotes mean nothing
+
+    reader = csv.reader(text(), strict=True)
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, strict=True)
-            for cells in reader:
-                if cells and any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#"):
-                    yield reader.line_num, [cell.strip() for cell in cells]
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                yield reader.line_num, [cell.strip() for cell in cells], ended
     except OSError as error:
         raise TableError(path, f"cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise TableError(path, f"is not UTF-8 text: {error.reason} at byte {error.start}; save it as UTF-8 CSV") from error
     except csv.Error as error:
         raise TableError(path, f"is not a comma-separated table: {error}", reader.line_num) from error
 
 
-def _plain(name: str) -> str:
-    """Column name in small letters without its unit: 'Theta_i [deg]' and 'theta_i_deg' are theta_i, 'f_r_per_sr' is f_r."""
+def _rows(path: Path, names: list[str], lines: Iterator[tuple[int, list[str], bool]]) -> list[tuple[int, dict[str, str]]]:
+    """Name the cells of each line."""
+    rows = []
+    for line, cells, ended in lines:
+        _require_width(path, line, cells, len(names), ended)
+        rows.append((line, dict(zip(names, cells, strict=True))))
+    return rows
+
+
+def _require_names(path: Path, line: int, names: list[str]) -> None:
+    if not names:
+        raise TableError(path, "no header line found; expected one naming the columns")
+    if len(names) == 1 and (other := re.search(r"[;\t|]", names[0])):
+        raise TableError(path, f"the header is separated by {other[0]!r}, expected commas", line)
+    if all(_is_number(name) for name in names):
+        raise TableError(path, "no header line found: the first line holds numbers, expected names of columns", line)
+    if twice := sorted({name for name in names if name and names.count(name) > 1}):
+        raise TableError(path, f"column {', '.join(twice)} appears twice in the header", line)
+
+
+def _require_width(path: Path, line: int, cells: list[str], width: int, ended: bool) -> None:
+    if len(cells) != width:
+        cut = "" if ended else "; the file ends within this line: it was perhaps cut short"
+        raise TableError(path, f"{len(cells)} cells, expected {width}{cut}", line)
+
+
+def _split(name: str) -> tuple[str, list[str]]:
+    """Part a column's name, in small letters, from its units: 'Theta_i [deg]' and 'theta_i_deg' are theta_i in deg, 'BRF%' is brf in %."""
+    units = []
+    if bracketed := re.fullmatch(r"(.+?)\s*(?:\[([^\[\]]+)\]|\(([^()]+)\)|(%))", name):
+        head, square, rounded, percent = bracketed.groups()
+        unit = _unit(square or rounded or percent)
+        if rounded is None or unit in UNIT_SPELLINGS.values():  # round brackets may hold anything
+            name, units = head, [unit]
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-    return re.sub(r"_(deg|degrees|per_sr|1_sr|sr_1)$", "", plain)
+    if suffixed := UNIT_SUFFIX.fullmatch(plain):
+        plain, units = suffixed[1], [_unit(suffixed[2]), *units]
+    return plain, units
+
+
+def _unit(text: str) -> str:
+    """One spelling for each known unit, others as they are."""
+    text = text.strip(" []()")
+    return UNIT_SPELLINGS.get(text.lower(), text)
+
+
+def _roles(path: Path, line: int, names: list[str], given: Mapping[str, str | float]) -> dict[str, str | float | None]:
+    """Say which column or constant is what."""
+    if unknown := sorted(set(given) - set(ROLES)):
+        raise TableError(path, f"no such role: {', '.join(unknown)}; columns may be given for {', '.join(ROLES)}")
+    # An azimuth that was named makes the others that are there those of something else.
+    told = {"phi"} & set(given), {"phi_i", "phi_r"} & set(given)
+    if all(told):
+        raise TableError(path, "columns may be given for phi, or for phi_i and phi_r, not for both", line)
+    passed = ("phi_i", "phi_r") if told[0] else ("phi",) if told[1] else ()
+    roles = {role: None if role in passed else _find(path, line, names, role, given.get(role)) for role in ROLES}
+    phi, phi_i, phi_r = (roles[role] for role in ("phi", "phi_i", "phi_r"))
+    if phi is not None and (phi_i is not None or phi_r is not None):
+        raise TableError(path, f"the azimuth may be {phi}, or that from {phi_i} to {phi_r}: say which with columns", line)
+    if (phi_i is None) != (phi_r is None):
+        there, lacking = ("phi_i", "phi_r") if phi_r is None else ("phi_r", "phi_i")
+        raise TableError(path, f"{roles[there]} is an azimuth without its {lacking}: name that with columns, or else phi; 0 may do", line)
+    return roles
 
 
 def _find(path: Path, line: int, names: list[str], role: str, given: str | float | None) -> str | float | None:
-    """Name the column of a role, or its constant, or None for a sigma that is not there."""
-    if isinstance(given, str):
-        if given not in names:
-            raise TableError(path, f"no column {given!r} for {role}; there are {', '.join(names)}", line)
-        return given
+    """Name the column of a role, or its constant, or None for one that is not there and need not be."""
+    if isinstance(given, str) and given not in names:
+        if _is_number(given):
+            return float(given)
+        raise TableError(path, f"no column {given!r} for {role}; there are {_some(names)}", line)
     if given is not None:
         return given
     wanted = frozenset[str]().union(*(ALIASES[q] for q in UNITS)) if role == "value" else ALIASES[role]
-    found = [name for name in names if _plain(name) in wanted]
+    found = [name for name in names if _split(name)[0] in wanted]
     if len(found) > 1:
         raise TableError(path, f"{role} may be any of {', '.join(found)}: say which with columns", line)
-    if not found and role != "sigma":
-        raise TableError(path, f"no column found for {role}; there are {', '.join(names)}: name one of them with columns", line)
+    if not found and role in NEEDED:
+        raise TableError(path, f"no column found for {role}; there are {_some(names)}: name one of them with columns", line)
     return found[0] if found else None
 
 
+def _names_units(row: Mapping[str, str], named: Mapping[str, str]) -> bool:
+    """Whether a row holds no reading but the columns' units."""
+    angles = [row[name] for role, name in named.items() if role in ANGLES]
+    return bool(angles) and all(_unit(cell) in ("deg", "rad") for cell in angles)
+
+
+def _unit_column(path: Path, names: list[str], rows: list[tuple[int, dict[str, str]]]) -> Said:
+    """The unit that a column of units says, which must be one."""
+    for name in names:
+        if _split(name)[0] in ("unit", "units"):
+            said = [(_unit(row[name]), line) for line, row in rows]
+            for unit, line in said:
+                if unit != said[0][0]:
+                    mix = f"{name} is {unit!r}, but {said[0][0]!r} in line {said[0][1]}"
+                    raise TableError(path, f"{mix}: readings of one table share one unit; choose the rows", line)
+            return [(unit, line) for unit, line in said[:1] if unit]
+    return []
+
+
+def _said(path: Path, name: str, said: Said) -> tuple[str, int | None]:
+    """The one unit that is said of a column, "" if none is."""
+    for unit, line in said:
+        if unit != said[0][0]:
+            raise TableError(path, f"{name} is said to be in {said[0][0]} and in {unit}", line)
+    return said[0] if said else ("", None)
+
+
+def _require_degrees(path: Path, named: Mapping[str, str], units: Mapping[str, Said]) -> None:
+    for role, name in named.items():
+        unit, line = _said(path, name, units[role])
+        if role in ANGLES and unit not in ("", "deg"):
+            raise TableError(path, f"{name} is in {unit}, expected deg", line)
+
+
+def _quantity(path: Path, name: str, given: Quantity | None, units: Said) -> tuple[Quantity, str]:
+    """Say what the values are, and in which unit if that is named."""
+    plain, _ = _split(name)
+    by_name: Quantity = next((q for q in QUANTITIES if plain in ALIASES[q]), "intensity")
+    kind = given or by_name
+    if kind not in UNITS:
+        raise FitError(f"{path}: unknown quantity {kind!r}; known are {', '.join(UNITS)}")
+    unit, line = _said(path, name, units)
+    if unit:
+        fits = {"intensity": unit not in ("1/sr", "deg", "rad"), "reflectance-factor": unit in ("1", "%"), "brdf": unit == "1/sr"}[kind]
+        wanted = {"intensity": "neither 1/sr nor that of an angle", "reflectance-factor": "1 or %", "brdf": "1/sr"}[kind]
+        if not fits:
+            why = "as asked" if given else "by its name"
+            raise TableError(path, f"{name} is in {unit}, but {why} it is {kind}, whose unit is {wanted}: say which quantity it is", line)
+    return kind, unit
+
+
+def _require_one_unit(path: Path, of_sigma: Said, of_value: str) -> None:
+    for unit, line in of_sigma:
+        if unit != of_value:
+            raise TableError(path, f"sigma is in {unit}, but the values are in {of_value}: bring both to one unit", line)
+
+
+def _azimuth(path: Path, read: Mapping[str, Array], lines: list[int]) -> Array:
+    """phi_r - phi_i, -180 to 180; 0 where the table has none."""
+    for role in ("phi", "phi_i", "phi_r"):
+        if role in read and not np.all(good := np.abs(read[role]) <= 360):
+            bad = int(np.flatnonzero(~good)[0])
+            raise TableError(path, f"{role} is {read[role][bad]:g}, expected -360 <= {role} <= 360 deg", lines[bad])
+    return wrapped(read["phi_r"] - read["phi_i"]) if "phi_r" in read else wrapped(read.get("phi", np.zeros(len(lines))))
+
+
+def _turned(found: Measurements) -> Measurements:
+    """Count directions from the other side of the normal: half a turn about it."""
+    theta_r = np.where(found.in_plane, 0.0 - found.theta_r_deg, found.theta_r_deg)
+    phi = np.where(found.in_plane, 0.0, found.phi_deg - np.copysign(180, found.phi_deg))
+    return replace(found, theta_r_deg=theta_r, phi_deg=phi)
+
+
+def _without_repeats(found: Measurements, repeats: Repeats) -> Measurements:
+    """Refuse, keep or average readings at the same angles."""
+    angles = np.round(np.column_stack([found.theta_i_deg, found.theta_r_deg, found.phi_deg]), 6) + 0.0
+    _, first, which, count = np.unique(angles, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    if repeats == "keep" or len(first) == len(found):
+        return found
+    which = which.reshape(-1)
+    if repeats == "refuse":
+        again = int(np.flatnonzero(first[which] != np.arange(len(found)))[0])
+        problem = f"the same angles as in line {found.rows[first[which[again]]]}: choose rows, or say with repeats that they are repeats"
+        raise found.error(again, problem)
+    order = np.argsort(which, kind="stable")
+    starts = np.cumsum(count) - count
+
+    def summed(values: Array) -> Array:
+        return np.add.reduceat(values[order], starts, axis=0)
+
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused as not finite
+        value = summed(found.value) / count
+        sigma, covariance = None, None
+        if found.covariance is not None:
+            covariance = summed(summed(found.covariance).T) / count[:, None] / count
+            covariance = (covariance + covariance.T) / 2
+        elif found.sigma is not None:
+            sigma = np.sqrt(summed(found.sigma**2)) / count
+        elif np.all(count > 1):
+            sigma = np.sqrt(summed((found.value - value[which]) ** 2) / np.maximum(count - 1, 1) / count)
+        merged = replace(found.take(first), value=value, sigma=sigma, covariance=covariance)
+    return merged.take(np.argsort(first))
+
+
+def _require_light(found: Measurements) -> None:
+    """Refuse readings that cannot be light: 0 is noise only where there is noise."""
+    noise = np.zeros(len(found)) if found.sigma is None else found.sigma
+    if np.any(dark := found.value / NOISE <= -noise):
+        bad = int(np.flatnonzero(dark)[0])
+        known = "no sigma says that this is noise" if found.sigma is None else f"its sigma is {noise[bad]:g}"
+        raise found.error(
+            bad, f"reading is {found.value[bad]:g} and {known}: no light can be that; look at the dark reading or leave it out"
+        )
+
+
+def _matrix(path: Path, n: int, table: Path) -> Array:
+    """Read the n rows of n numbers that belong to a table."""
+    rows = []
+    for line, cells, ended in _lines(path):
+        _require_width(path, line, cells, n, ended)
+        rows.append([_number(path, line, f"column {k}", cell) for k, cell in enumerate(cells, 1)])
+    if len(rows) != n:
+        raise TableError(path, f"{len(rows)} rows, expected {n}, one for each row of {table}")
+    return np.array(rows)
+
+
 def _number(path: Path, line: int, name: str, cell: str) -> float:
-    try:
-        number = float(cell)
-    except ValueError:
-        raise TableError(path, f"{name} is {cell!r}, expected a number", line) from None
+    if not _is_number(cell):
+        hint = ": name the unit in the header, as in 'brf [%]'" if cell.endswith("%") else ""
+        raise TableError(path, f"{name} is {cell!r}, expected a number{hint}", line)
+    number = float(cell)
     if not math.isfinite(number):
         raise TableError(path, f"{name} is {cell}, expected a finite number", line)
     return number
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return cell.isascii() and "_" not in cell  # float takes more than tables hold
 
 
 def _same(cell: str, wanted: str | float) -> bool:
@@ -293,11 +678,10 @@ def _require_rows(path: Path, count: int, where: Mapping[str, str | float], seen
     if count >= MIN_READINGS:
         return
     chosen = " where " + " and ".join(f"{name} = {wanted}" for name, wanted in where.items()) if where else ""
-    there = "".join(f"; {name} takes {_some(values)}" for name, values in seen.items())
+    there = "".join(f"; {name} takes {_some(sorted(values))}" for name, values in seen.items())
     raise TableError(path, f"{count or 'no'} rows{chosen}, expected at least {MIN_READINGS}{there}")
 
 
-def _some(values: set[str]) -> str:
-    """List a few values, in order."""
-    listed = sorted(values)
-    return ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "")
+def _some(values: Sequence[str]) -> str:
+    """List a few."""
+    return ", ".join(values[:12]) + (f" and {len(values) - 12} more" if len(values) > 12 else "")

@@ -131,6 +131,14 @@ def towards_light(axes: Any, theta_i: float) -> None:
     axes.text(*place, "L", fontweight="bold", color="0.25", ha="center", va="center")
 
 
+def round_up(value: float) -> float:
+    """Return the next round number that is round in quarters, too."""
+    if value <= 0:
+        return 1.0
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1, 1.2, 1.6, 2, 2.4, 3.2, 4, 6, 8, 10) if step * power >= value * 0.999)
+
+
 def _scale(fits: Sequence["StoredFit"], wanted: float) -> float:
     """Return the paper's scale, or a multiple of it where the readings would not fit."""
     largest = max(max(*fit.fit.measured, *fit.fit.modelled) for fit in fits)
@@ -166,7 +174,7 @@ def _lobes(figure: "Figure", stored: "StoredFit") -> None:
 
     theta_i = float(np.median(stored.fit.theta_i_deg))
     fine = np.arange(-89.0, 89.5, 1.0)
-    terms = paper_terms(np.full(fine.size, theta_i), fine, aspect=stored.fit.aspect)
+    terms = paper_terms(np.full(fine.size, theta_i), fine, aspect=stored.fit.shape["aspect"])
     axes = _polar_axes(figure, 1.0, theta_i, "")
     for (name, text), column in zip(TERMS.items(), terms.T, strict=True):
         enlarged = SPEC_ENLARGED if name == "u_spec" else 1.0
@@ -179,7 +187,7 @@ def _lobes(figure: "Figure", stored: "StoredFit") -> None:
             linewidth=1.5,
             label=f"$r'_{{{name.replace('_', ',')}}}$ {text}{f' (x{enlarged:g})' if enlarged != 1 else ''}",
         )
-    figure.text(0.985, 0.975, f"aspect {stored.fit.aspect:g}", ha="right", va="top")
+    figure.text(0.985, 0.975, f"aspect {stored.fit.shape['aspect']:g}", ha="right", va="top")
     figure.legend(loc="upper left", bbox_to_anchor=(0.0, 1.0), frameon=False)
 
 

@@ -15,10 +15,10 @@ from rig.files import write_atomically
 from rig.runs import Reading, Run, good_readings
 
 if TYPE_CHECKING:
+    from fitting.fit import Fit
     from fitting.measurements import Measurements
-    from fitting.mixture import MixtureFit
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 NANO = 1e-9
 ANGLE_DIGITS = 3
 """Readbacks are fitted to a thousandth of a degree: below what the arms resolve."""
@@ -85,7 +85,7 @@ class StoredFit:
     label: str
     simulated: bool
     provenance: dict[str, Any]
-    fit: "MixtureFit"
+    fit: "Fit"
 
     def to_dict(self) -> dict[str, Any]:
         """Return all of it for JSON."""
@@ -100,30 +100,25 @@ class StoredFit:
         }
 
 
-def new_fit(label: str, simulated: bool, provenance: dict[str, Any], fit: "MixtureFit") -> StoredFit:
+def new_fit(label: str, simulated: bool, provenance: dict[str, Any], fit: "Fit") -> StoredFit:
     """Return `fit` with a name of its own."""
     return StoredFit(f"{time.strftime('%Y-%m-%d')}_{label}_{uuid.uuid4().hex[:8]}", time.time(), label, simulated, provenance, fit)
 
 
 def refitted(stored: StoredFit, aspect: float) -> StoredFit:
-    """Return the same readings fitted with cells of another shape, not stored; readings weighted by sigma are weighted relatively."""
-    import numpy as np
-
-    from fitting.measurements import Measurements
-    from fitting.mixture import fit_mixture
+    """Return the same readings fitted by the paper's model with cells of another shape, not stored."""
+    from fitting.fit import fit
 
     old = stored.fit
-    readings = Measurements(
-        theta_i_deg=np.asarray(old.theta_i_deg),
-        theta_r_deg=np.asarray(old.theta_r_deg),
-        value=np.asarray(old.measured),
-        quantity="intensity",
-        unit=old.unit,
-        source=old.source,
-        rows=np.asarray(old.rows),
-    )
-    fit = fit_mixture(readings, aspect=aspect, weights="plain" if old.weights == "plain" else "relative")
-    return new_fit(stored.label, stored.simulated, stored.provenance, fit)
+    again = fit(old.measurements, "paper", shape={"aspect": aspect}, weights=old.linear.weights, aperture=old.aperture)
+    return new_fit(stored.label, stored.simulated, stored.provenance, again)
+
+
+def fit_run(run: Run) -> StoredFit:
+    """Return the paper's fit of `run` with its usual shape, not stored."""
+    from fitting.fit import fit
+
+    return new_fit(run.cultivar, run.simulated, provenance_of_run(run), fit(measurements_of(run)))
 
 
 def provenance_of_run(run: Run) -> dict[str, Any]:
@@ -149,13 +144,34 @@ def store_fit(fits: Path, fit: StoredFit) -> Path:
 
 def read_fit(path: Path) -> StoredFit:
     """Read a stored fit; raise RunError where the file is not one."""
-    from fitting.mixture import MixtureFit
+    from fitting.errors import FitError
+    from fitting.fit import Fit
 
     try:
         doc = json.loads(path.read_text(encoding="utf-8"))
-        return StoredFit(doc["id"], doc["time"], doc["label"], doc["simulated"], doc["provenance"], MixtureFit.from_dict(doc))
-    except (OSError, ValueError, KeyError, TypeError) as exc:
+        found = _from_version_1(doc) if doc["schema_version"] == 1 else Fit.from_dict(doc)
+        return StoredFit(doc["id"], doc["time"], doc["label"], doc["simulated"], doc["provenance"], found)
+    except (OSError, ValueError, KeyError, TypeError, FitError) as exc:
         raise RunError(f"{path}: not a stored fit: {exc!r}") from exc
+
+
+def _from_version_1(doc: dict[str, Any]) -> "Fit":
+    """Fit anew what the first version stored: it kept intensities, and no sigma."""
+    import numpy as np
+
+    from fitting.fit import fit
+    from fitting.measurements import Measurements
+
+    readings = Measurements(
+        theta_i_deg=np.array(doc["theta_i_deg"], float),
+        theta_r_deg=np.array(doc["theta_r_deg"], float),
+        value=np.array(doc["measured"], float),
+        unit=doc["unit"],
+        source=doc["source"],
+        rows=np.array(doc["rows"]),
+    )
+    shape = {name: float(doc[name]) for name in ("aspect", "n_us", "n_ss")}
+    return fit(readings, "paper", shape=shape, weights="plain" if doc["weights"] == "plain" else "relative")
 
 
 def list_fits(fits: Path) -> list[StoredFit]:
@@ -163,12 +179,13 @@ def list_fits(fits: Path) -> list[StoredFit]:
     return sorted((read_fit(path) for path in fits.glob("*.json")), key=lambda fit: fit.time) if fits.is_dir() else []
 
 
-def latest_fit(fits: Path, label: str) -> StoredFit:
-    """Return the newest fit of a run of the cultivar `label`; raise RunError where there is none."""
+def latest_fit(fits: Path, label: str, model: str | None = None) -> StoredFit:
+    """Return the newest fit of a run of the cultivar `label`, by `model` if one is named; raise RunError where there is none."""
     for fit in reversed(list_fits(fits)):
-        if fit.label == label and "run" in fit.provenance:
+        if fit.label == label and "run" in fit.provenance and model in (None, fit.fit.model):
             return fit
-    raise RunError(f"no fit of {label} in {fits}; make one: rig fit --cultivar {label}")
+    by = f" by the model {model}" if model else ""
+    raise RunError(f"no fit of {label}{by} in {fits}; make one: rig fit --cultivar {label}")
 
 
 def fit_of_run(fits: Path, run: Run) -> StoredFit | None:

@@ -69,11 +69,14 @@ def marked(image: Any, marks: Sequence[str]) -> Any:
 
 
 def shade_of(fit: StoredFit, workspace: Workspace) -> "Reflectance":
-    """Return the intensity of eq. (8) for any direction, as `fit` has it; its model is kept in the workspace."""
+    """Return the fitted intensity for any direction; the paper's model is kept in the workspace, the others are tabulated anew."""
     from fitting.cells import Cell
 
-    model = stored_model(workspace, "paper", Cell(fit.fit.aspect), n_us=fit.fit.n_us, n_ss=fit.fit.n_ss)
-    return model.reflectance(**fit.fit.x)
+    shape = fit.fit.shape
+    if fit.fit.model == "paper":
+        model = stored_model(workspace, "paper", Cell(shape["aspect"]), n_us=shape["n_us"], n_ss=shape["n_ss"])
+        return model.reflectance(**fit.fit.x)
+    return fit.fit.tabulated()
 
 
 def frame(raycaster: "Raycaster", width: int, height: int, towards: tuple[float, float, float] = ABOVE) -> "Camera":

@@ -20,6 +20,7 @@ import numpy as np
 from fitting.errors import DomainError, TableError
 from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered, ask
 from fitting.formats.text import write_lines
+from fitting.progress import Progress, silent, stage
 
 Side = Literal["front", "back"]
 
@@ -76,7 +77,7 @@ def read_klems(path: Path | str, *, quantity: Quantity = "brdf", side: Side = "f
     if structure.words not in ("Columns", "Rows"):
         expected = "Columns or Rows; make a matrix of a tensor tree with Radiance's bsdf2klems"
         raise TableError(path, f"IncidentDataStructure is {structure.words[:40]!a}, expected {expected}", structure.line)
-    block = _block(path, layers[0], _BLOCKS[quantity, side], wavelength)
+    block, others = _block(path, layers[0], _BLOCKS[quantity, side], wavelength)
     data = block.one(path, "ScatteringData")
     kind = block.one(path, "ScatteringDataType")
     if kind.words not in ("BTDF", "BRDF", "BSDF"):
@@ -100,19 +101,20 @@ def read_klems(path: Path | str, *, quantity: Quantity = "brdf", side: Side = "f
         values=matrix.T.reshape(-1, 1),
         quantity=quantity,
         source=str(path),
-        metadata={"side": side, "wavelength": wavelength, "direction": _BLOCKS[quantity, side]},
+        metadata={"side": side, "wavelength": wavelength, "direction": _BLOCKS[quantity, side], "others": others},
     )
 
 
 def write_klems(
     path: Path | str,
-    reflected: Function | Brdf,
+    reflected: Function | Brdf | None,
     *,
     transmitted: Function | Brdf | None = None,
     basis: str = "LBNL/Klems Full",
     samples: int = 4,
     name: str = "petal",
     manufacturer: str = "",
+    progress: Progress = silent,
 ) -> None:
     """Write a matrix that Radiance loads as a material.
 
@@ -123,8 +125,9 @@ def write_klems(
     ----------
     path : Path or str
         The file; what is there is replaced.
-    reflected : callable or isotropic Brdf
-        f(theta_i, theta_r, phi), 1/sr, for light from the front, up to 90 deg.
+    reflected : callable or isotropic Brdf, or None
+        f(theta_i, theta_r, phi), 1/sr, for light from the front, up to 90 deg. None where only what goes through is known: the file then
+        says nothing of reflection.
     transmitted : callable or isotropic Brdf, optional
         The same for light that goes through, theta_r from 90 to 180 deg.
     basis : str
@@ -133,6 +136,8 @@ def write_klems(
         Of each patch in theta and in phi: samples^4 are taken for each number.
     name, manufacturer : str
         Of the material.
+    progress : callable
+        See `fitting.progress`: with a table that is slow to look up it takes seconds.
 
     Raises
     ------
@@ -143,16 +148,21 @@ def write_klems(
     """
     if basis not in BASES or samples < 1:
         raise DomainError(f"basis {basis!r} and {samples} samples: expected {', '.join(BASES)}, and 1 or more")
+    if reflected is None and transmitted is None:
+        raise DomainError("neither what is reflected nor what goes through was given")
     for given in (reflected, transmitted):
         if isinstance(given, Brdf) and given.phi_i_deg is not None:
             raise DomainError(f"{given.source}: is not isotropic; it would be written as if its first phi_i stood for all")
-    blocks = {"Reflection Back": _averaged(reflected, BASES[basis], samples, through=False)}
+    middle = 1.0 if transmitted is None else 0.0 if reflected is None else 0.5
+    blocks = {}
+    if reflected is not None:
+        blocks["Reflection Back"] = _averaged(reflected, BASES[basis], samples, stage(progress, 0, middle), through=False)
     if transmitted is not None:
-        blocks["Transmission Back"] = _averaged(transmitted, BASES[basis], samples, through=True)
+        blocks["Transmission Back"] = _averaged(transmitted, BASES[basis], samples, stage(progress, middle, 1), through=True)
     write_lines(path, _written(blocks, basis, name, manufacturer))
 
 
-def _averaged(function: Function, rings: tuple[tuple[float, int], ...], samples: int, *, through: bool) -> Array:
+def _averaged(function: Function, rings: tuple[tuple[float, int], ...], samples: int, progress: Progress, *, through: bool) -> Array:
     """Mean over pairs of patches, of shape (exiting, incident)."""
     theta, phi = _spread(rings, samples)  # (patch, sample)
     theta_r = 180 - theta if through else theta
@@ -161,6 +171,7 @@ def _averaged(function: Function, rings: tuple[tuple[float, int], ...], samples:
         difference = phi.ravel() - (phi[k, :, None] + 180)
         values = ask(function, theta[k, :, None], theta_r.ravel(), difference)[..., 0]
         matrix[:, k] = values.reshape(values.shape[0], *theta.shape).mean(axis=(0, 2))
+        progress((k + 1) / len(theta))
     return matrix
 
 
@@ -289,16 +300,20 @@ def _parse(path: Path | str) -> _Element:
     return top.children[0]
 
 
-def _block(path: Path | str, layer: _Element, direction: str, wavelength: str) -> _Element:
-    """Find one direction and band."""
-    there = []
+def _block(path: Path | str, layer: _Element, direction: str, wavelength: str) -> tuple[_Element, list[str]]:
+    """Find one direction and band, and the names of the others."""
+    there: list[str] = []
+    wanted: _Element | None = None
     for data in layer.all("WavelengthData"):
         band = data.one(path, "Wavelength").words
         for block in data.all("WavelengthDataBlock"):
             found = block.one(path, "WavelengthDataDirection").words
-            there.append(f"{found} ({band})")
-            if found == direction and band.lower() == wavelength.lower():
-                return block
+            if wanted is None and found == direction and band.lower() == wavelength.lower():
+                wanted = block
+            else:
+                there.append(f"{found} ({band})")
+    if wanted is not None:
+        return wanted, there
     raise TableError(path, f"no {direction} ({wavelength}); there is {', '.join(there)[:200] or 'no data'}", layer.line)
 
 

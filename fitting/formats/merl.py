@@ -10,6 +10,7 @@ variables for efficient BRDF representation", doi:10.1007/978-3-7091-6453-2_2.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,15 +113,20 @@ class Merl:
         places = (np.sqrt(90 * half), diff, np.mod(around, 180.0))
         lower = [np.floor(place - 0.5) for place in places]
         shares = [place - 0.5 - low for place, low in zip(places, lower, strict=True)]
-        total, found = np.zeros(half.shape), np.zeros((*half.shape, 3))
-        for corner in np.ndindex(2, 2, 2):
-            at = [(low + c).astype(np.intp) for low, c in zip(lower, corner, strict=True)]
-            weight = np.prod([share if c else 1 - share for share, c in zip(shares, corner, strict=True)], axis=0)
-            bins = (np.clip(at[0], 0, 89), np.clip(at[1], 0, 89), at[2] % 180)
-            weight = np.where(self.valid[bins], weight, 0.0)
+        total, found = np.zeros(half.shape), np.zeros((3, *half.shape))
+        values, valid = self.values.reshape(-1), self.valid.reshape(-1)  # flat, which is quicker than through their axes
+        sides = []
+        for low, share, count, round_ in zip(lower, shares, BINS, (False, False, True), strict=True):
+            at = [(low + c).astype(np.intp) for c in (0, 1)]
+            at = [np.mod(k, count) if round_ else np.clip(k, 0, count - 1) for k in at]
+            sides.append(list(zip(at, (1 - share, share), strict=True)))
+        for (j, share_j), (k, share_k), (m, share_m) in itertools.product(*sides):
+            bins = (j * BINS[1] + k) * BINS[2] + m
+            weight = share_j * share_k * share_m * valid[bins]
             total += weight
-            found += weight[..., None] * self.values[bins]
-        return total, found
+            for plane in range(3):
+                found[plane] += weight * values[3 * bins + plane]
+        return total, np.moveaxis(found, 0, -1)
 
 
 def half_difference(theta_i_deg: ArrayLike, theta_r_deg: ArrayLike, phi_deg: ArrayLike) -> tuple[Array, Array, Array]:

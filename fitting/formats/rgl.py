@@ -483,12 +483,17 @@ def _cell(at: Array, points: int) -> tuple[NDArray[np.intp], Array]:
 def _looked_up(pictures: Singles, u: Array, v: Array, slices: list[tuple[Any, Any, Any]]) -> Array:
     """Bilinear values of pictures (p, t, c, v, u), mixed over slices; shape (n, c)."""
     (row, y), (column, x) = _cell(v, pictures.shape[-2]), _cell(u, pictures.shape[-1])
-    found = np.zeros((len(u), pictures.shape[2]))
+    channels, rows, columns = pictures.shape[2:]
+    planes = pictures.reshape(-1)  # one number at a time out of a flat array: several times quicker than through five axes
+    found = np.zeros((channels, len(u)))
     for p, t, weight in slices:
+        picture = (p * pictures.shape[1] + t) * channels
         for dy, wy in ((0, 1 - y), (1, y)):
             for dx, wx in ((0, 1 - x), (1, x)):
-                found += (weight * wy * wx)[:, None] * pictures[p, t, :, row + dy, column + dx]
-    return found
+                share, place = weight * wy * wx, (picture * rows + row + dy) * columns + column + dx
+                for c in range(channels):
+                    found[c] += share * planes[place + c * rows * columns]
+    return found.T
 
 
 def _running(table: Array) -> Array:

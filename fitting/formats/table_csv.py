@@ -11,14 +11,14 @@ import numpy as np
 from fitting.errors import DomainError, TableError
 from fitting.formats.grid import Brdf, Function, Quantity, Scattered, readings
 from fitting.formats.text import lines, numbers, once, one_line, require, write_lines
-from fitting.measurements import Measurements
+from fitting.measurements import Measurements, wrapped
 
 ANGLES = ("theta_i_deg", "phi_i_deg", "theta_r_deg", "phi_r_deg")
 VALUE_COLUMNS = {"brdf": "brdf_per_sr", "reflectance-factor": "reflectance_factor", "intensity": "intensity"}
 
 
-def in_plane(data: Scattered, *, channel: str | None = None, tolerance_deg: float = 1e-6) -> Measurements:
-    """Take the readings in the plane of incidence, as the fit wants them.
+def measurements_of_scattered(data: Scattered, *, channel: str | None = None) -> Measurements:
+    """Take the readings of one channel, as the fit wants them.
 
     Parameters
     ----------
@@ -26,13 +26,11 @@ def in_plane(data: Scattered, *, channel: str | None = None, tolerance_deg: floa
         From any file.
     channel : str, optional
         Which; may be left out where there is one.
-    tolerance_deg : float
-        How far phi_r - phi_i may be from 0 or 180 deg. At theta_r = 0 it does not matter.
 
     Returns
     -------
     Measurements
-        theta_r positive on the light's side; its rows count the readings from 1.
+        In the plane of incidence theta_r is positive on the light's side; its rows count the readings from 1.
 
     Raises
     ------
@@ -45,18 +43,21 @@ def in_plane(data: Scattered, *, channel: str | None = None, tolerance_deg: floa
     if name not in data.channels:
         raise DomainError(f"{data.source}: no channel {channel!r}; choose one of {', '.join(data.channels)}")
     k = data.channels.index(name)
-    off = np.abs((data.phi_r_deg - data.phi_i_deg + 90) % 360 - 90)  # -90 .. 270: 0 is the light's side, 180 the other
-    light = (off <= tolerance_deg) | (data.theta_r_deg == 0)
-    kept = light | (np.abs(off - 180) <= tolerance_deg)
     return Measurements(
-        theta_i_deg=data.theta_i_deg[kept],
-        theta_r_deg=np.where(light, data.theta_r_deg, 0.0 - data.theta_r_deg)[kept],
-        value=data.values[kept, k],
-        sigma=None if data.sigma is None else data.sigma[kept, k],
+        theta_i_deg=data.theta_i_deg,
+        theta_r_deg=data.theta_r_deg,
+        value=data.values[:, k],
+        sigma=None if data.sigma is None else data.sigma[:, k],
         quantity="brdf",
         source=data.source,
-        rows=np.flatnonzero(kept) + 1,
+        phi_deg=wrapped(data.phi_r_deg - data.phi_i_deg),
     )
+
+
+def in_plane(data: Scattered, *, channel: str | None = None) -> Measurements:
+    """Take those of `measurements_of_scattered` that are in the plane of incidence."""
+    taken = measurements_of_scattered(data, channel=channel)
+    return taken.take(taken.in_plane)
 
 
 def write_csv(path: Path | str, data: Function | Brdf | Scattered | Measurements) -> None:
@@ -67,8 +68,8 @@ def write_csv(path: Path | str, data: Function | Brdf | Scattered | Measurements
     path : Path or str
         The file; what is there is replaced.
     data : callable, Brdf, Scattered or Measurements
-        Measurements are written with theta_r signed, as `fitting.read_csv` reads them; everything else with both azimuths, as `read_table`
-        does.
+        Measurements are written as `fitting.read_csv` reads them, theta_r signed, with phi if any is out of the plane of incidence, and
+        without correlations; everything else with both azimuths, as `read_table` does.
 
     Raises
     ------
@@ -79,6 +80,8 @@ def write_csv(path: Path | str, data: Function | Brdf | Scattered | Measurements
     """
     if isinstance(data, Measurements):
         columns = {"theta_i_deg": data.theta_i_deg, "theta_r_deg": data.theta_r_deg, VALUE_COLUMNS[data.quantity]: data.value}
+        if not data.in_plane.all():
+            columns["phi_deg"] = data.phi_deg
         if data.sigma is not None:
             columns["sigma"] = data.sigma
     else:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import click
 
-from rig.cli.fit import fit_run
 from rig.cli.flower import assembly_table, put_together
 from rig.cli.scan import import_petals
 from rig.cli.settings import Settings
@@ -14,7 +13,7 @@ from rig.cli.sweep import run_sweep
 from rig.config import load_config
 from rig.cultivars import TABLE_1
 from rig.errors import ConfigError
-from rig.fits import ROSE_ASPECT, StoredFit, refitted, store_fit
+from rig.fits import ROSE_ASPECT, StoredFit, fit_run, refitted, store_fit
 from rig.measuring import new_order
 from rig.progress import steps
 from rig.runs import Run, new_run_path
@@ -103,7 +102,7 @@ def picture_rose(flower: Path, fits: dict[str, StoredFit], workspace: Workspace)
 def closing_table(fits: dict[str, StoredFit], runs: dict[str, Run]) -> str:
     """Return x, E and the texture's ratio I(+40)/I(-40) per cultivar, and E with the rose's own tall cells, as lines."""
     names = [f"x_{name}" for name in next(iter(fits.values())).fit.x]
-    aspect = next(iter(fits.values())).fit.aspect
+    aspect = next(iter(fits.values())).fit.shape["aspect"]
     lines = [f"SIMULATED: the paper's model (aspect {aspect:g}), fitted to the simulated bench's readings, in nA", ""]
     titles = [*names, "mean E %", "max E %", f"E, {ROSE_ASPECT:g} %"]
     lines.append(f"{'':<4}" + "".join(f"{title:>10}" for title in titles) + f"{'I(+40)/I(-40)':>15}   run")

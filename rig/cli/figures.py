@@ -17,7 +17,7 @@ def command(settings: Settings, flower: Path | None, out: str | None) -> None:
     """Draw the paper's figures 1, 2, 6, 7, 8 and 9 from the newest fit of each cultivar, as PNG and SVG."""
     from rig.figures import draw_all
 
-    fits = {cultivar.abbreviation: latest_fit(settings.workspace.fits, cultivar.abbreviation) for cultivar in TABLE_1}
+    fits = {cultivar.abbreviation: latest_fit(settings.workspace.fits, cultivar.abbreviation, "paper") for cultivar in TABLE_1}
     folder = Path(out) if out else settings.workspace.figures
     for path in draw_all(fits, folder):
         click.echo(path)

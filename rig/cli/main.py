@@ -16,6 +16,7 @@ COMMANDS = {
     "runs": ("rig.cli.runs", "List, show and annotate stored runs."),
     "cultivars": ("rig.cli.cultivars", "List the known cultivars, or add one."),
     "fit": ("rig.cli.fit", "Fit the paper's reflection model to a run or a table."),
+    "brdf": ("rig.cli.brdf", "Convert files of reflectance, and fits, for other programs."),
     "model": ("rig.cli.model", "Evaluate the reflection model itself."),
     "scan": ("rig.cli.scan", "Turn range images of petals into meshes."),
     "flower": ("rig.cli.flower", "Put scanned petals together into a flower."),

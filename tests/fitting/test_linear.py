@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, nnls
 from scipy.stats import chi2, f, norm, t
 
-from fitting import TERMS, DomainError, FitError, ReadingError, paper_terms
-from fitting.linear import LinearFit, fit_linear, mixture_from, unit_reflectances
+from fitting import TERMS, FitError, ReadingError, paper_terms
+from fitting.linear import LinearFit, fit_linear, mixture_from
 
 VIEWS = np.arange(-70.0, 71, 10)
 POINT = norm.ppf(0.975) ** 2
@@ -347,7 +347,7 @@ def test_a_covariance_that_is_none(terms: np.ndarray) -> None:
         fit_linear(terms, values, covariance=np.eye(14))
     for weights in ("sigma", "covariance"):
         with pytest.raises(FitError, match="no covariance to weigh by"):
-            fit_linear(terms, values, weights=weights)  # type: ignore[arg-type]
+            fit_linear(terms, values, weights=weights)
     with pytest.raises(FitError, match="unknown weights 'chi2'"):
         fit_linear(terms, values, weights="chi2")  # type: ignore[arg-type]
 
@@ -388,15 +388,6 @@ def test_anything_is_fitted_without_nan_or_refused(terms: Any, values: Any, weig
 
 
 # Reflectances and eqs. (9) to (12)
-
-
-def test_unit_reflectances() -> None:
-    flat = unit_reflectances(aspect=1e-3, n_ss=7)
-    np.testing.assert_allclose(flat[[0, 2, 3]], [math.pi / (2 * math.sqrt(3)), 1, 2 / 9], rtol=1e-3)
-    fine = unit_reflectances(aspect=0.5, nodes=100)
-    np.testing.assert_allclose(unit_reflectances(aspect=0.5), fine, rtol=5e-3)
-    with pytest.raises(DomainError):
-        unit_reflectances(aspect=-1)
 
 
 def test_reflectances_are_coefficients_on_the_white_standards_scale(terms: np.ndarray) -> None:

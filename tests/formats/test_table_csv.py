@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from fitting import DomainError, FitError, Measurements, TableError, read_csv
 from fitting.formats.grid import Brdf, Scattered
-from fitting.formats.table_csv import in_plane, read_table, write_csv
+from fitting.formats.table_csv import in_plane, measurements_of_scattered, read_table, write_csv
 
 TEXT = """# a rose
 theta_i_deg,phi_i_deg,theta_r_deg,phi_r_deg,brdf_per_sr,sigma_per_sr
@@ -42,7 +42,7 @@ def test_measurements_through_the_reader_of_the_fit(tmp_path: Path, quantity: st
     data = Measurements(
         theta_i_deg=90 * random.random(20),
         theta_r_deg=180 * random.random(20) - 90,
-        value=random.normal(size=20),
+        value=0.01 + random.random(20),
         sigma=random.random(20) if with_sigma else None,
         quantity=quantity,  # type: ignore[arg-type]
         source="one\ntwo",
@@ -111,6 +111,19 @@ def test_plane_of_incidence() -> None:
     assert found.quantity == "brdf"
     with pytest.raises(DomainError, match="choose one of a, b"):
         in_plane(data)
+    everything = measurements_of_scattered(data, channel="b")
+    np.testing.assert_array_equal(everything.theta_r_deg, [10, -20, 30, 40, -50, 0, -135])
+    np.testing.assert_array_equal(everything.phi_deg, [0, 0, 90, 0, 0, 0, 0])
+    np.testing.assert_array_equal(everything.value, [1, 3, 5, 7, 9, 11, 13])
+
+
+def test_measurements_out_of_the_plane(tmp_path: Path) -> None:
+    theta_r, phi = [-10.0, 20, 30, 40], [0.0, 90, -179, 0.1]
+    data = Measurements([45.0] * 4, theta_r, [1.0, 2, 3, 4], quantity="brdf", phi_deg=phi)  # type: ignore[arg-type]
+    write_csv(tmp_path / "readings.csv", data)
+    back = read_csv(tmp_path / "readings.csv")
+    np.testing.assert_array_equal(back.theta_r_deg, theta_r)
+    np.testing.assert_array_equal(back.phi_deg, phi)
 
 
 @pytest.mark.parametrize(
