@@ -342,7 +342,7 @@ class Fit:
                 at_bounds=dict(stored["at_bounds"]),
                 linear=LinearFit.from_dict(stored["linear"]),
                 measurements=m,
-                aperture=Aperture(**stored["aperture"]),
+                aperture=Aperture.from_dict(stored["aperture"]),
                 converged=bool(stored["converged"]),
                 search=stored["search"],
                 shared_with=tuple(stored["shared_with"]),
@@ -517,7 +517,7 @@ def predictions(measurements: Measurements, model: str = "paper", **settings: An
         of = measurements.incidence_of == k
         for chosen, where in ((of & measurements.in_plane & ~known, ""), (of & ~measurements.in_plane, " out of the plane")):
             if chosen.any():
-                parts.append(predicted(found, measurements.take(chosen), f"{incidence:g} deg{where}, from {PREDICT_FROM:g} deg"))
+                parts.append(predicted(found, measurements.take(chosen), f"{round(incidence, 1):g} deg{where}, from {PREDICT_FROM:g} deg"))
     return tuple(parts)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fitting.errors import FitError, ReadingError
+from fitting.measurements import NOISE
 from fitting.paper import TERMS
 
 Weights = Literal["relative", "plain", "sigma", "covariance"]
@@ -41,9 +42,6 @@ ALIKE = 0.95
 """From this correlation on, two coefficients are said to be hard to tell apart."""
 
 CONFIDENCE = 0.95
-
-NOISE = 5.0
-"""A reading may lie this many standard deviations below 0 before it is an error and not noise."""
 
 ROUNDING = 1e-10
 """Curvatures and slopes of columns of unit length below this are zero."""
@@ -659,7 +657,7 @@ def _whitener(weights: str, target: Array, noise: Array | None, root: Array | No
     if weights not in ("sigma", "covariance"):
         raise FitError(f"unknown weights {weights!r}; known are relative, plain, sigma and covariance")
     if noise is None or root is None:
-        raise FitError(f"{source}: there is no covariance to weigh by: give one or use other weights")
+        raise FitError(f"{source}: there is no sigma and no covariance to weigh by: give one or use other weights")
     return _Rooted(root) if weights == "covariance" else _Scaled(1 / np.sqrt(np.diag(noise)))
 
 

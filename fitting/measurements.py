@@ -22,9 +22,6 @@ QUANTITIES: tuple[Quantity, ...] = ("intensity", "reflectance-factor", "brdf")
 UNITS: Mapping[str, str] = {"intensity": "relative", "reflectance-factor": "1", "brdf": "1/sr"}
 """Quantities a reading may have, with the unit a table is taken to be in unless another is named."""
 
-MIN_READINGS = 4
-"""The mixture has four coefficients."""
-
 INCIDENCE_STEP_DEG = 0.5
 """Incidences read back within this are one."""
 
@@ -329,7 +326,7 @@ def read_csv(
     TableError
         With file and line, if a file cannot be read or is cut short, a column is missing or ambiguous, a unit contradicts the quantity, a
         cell is not a finite number, a reading cannot be light (0 or less without a sigma, or 5 sigma below 0), angles come twice, or
-        fewer than four readings are left.
+        no reading is left.
     """
     path = Path(path)
     if theta_r_positive not in ("light", "forward"):
@@ -387,7 +384,6 @@ def read_csv(
         _require_light(found)
     except ReadingError as error:
         raise TableError(path, error.problem, error.row) from error
-    _require_rows(path, len(found), where or {}, {})
     return found
 
 
@@ -499,7 +495,9 @@ def _roles(path: Path, line: int, names: list[str], given: Mapping[str, str | fl
         raise TableError(path, f"the azimuth may be {phi}, or that from {phi_i} to {phi_r}: say which with columns", line)
     if (phi_i is None) != (phi_r is None):
         there, lacking = ("phi_i", "phi_r") if phi_r is None else ("phi_r", "phi_i")
-        raise TableError(path, f"{roles[there]} is an azimuth without its {lacking}: name that with columns, or else phi; 0 may do", line)
+        raise TableError(
+            path, f"{roles[there]} is an azimuth without its {lacking}: give that with columns, or phi=0 for the plane of incidence", line
+        )
     return roles
 
 
@@ -627,7 +625,7 @@ def _without_repeats(found: Measurements, repeats: Repeats) -> Measurements:
 def _require_light(found: Measurements) -> None:
     """Refuse readings that cannot be light: 0 is noise only where there is noise."""
     noise = np.zeros(len(found)) if found.sigma is None else found.sigma
-    if np.any(dark := found.value / NOISE <= -noise):
+    if np.any(dark := (found.value <= 0) & (found.value / NOISE <= -noise)):
         bad = int(np.flatnonzero(dark)[0])
         known = "no sigma says that this is noise" if found.sigma is None else f"its sigma is {noise[bad]:g}"
         raise found.error(
@@ -675,11 +673,11 @@ def _same(cell: str, wanted: str | float) -> bool:
 
 
 def _require_rows(path: Path, count: int, where: Mapping[str, str | float], seen: Mapping[str, set[str]]) -> None:
-    if count >= MIN_READINGS:
+    if count:
         return
     chosen = " where " + " and ".join(f"{name} = {wanted}" for name, wanted in where.items()) if where else ""
     there = "".join(f"; {name} takes {_some(sorted(values))}" for name, values in seen.items())
-    raise TableError(path, f"{count or 'no'} rows{chosen}, expected at least {MIN_READINGS}{there}")
+    raise TableError(path, f"no rows{chosen}, expected at least 1{there}")
 
 
 def _some(values: Sequence[str]) -> str:

@@ -1,4 +1,7 @@
-"""A slow function of one or two shape numbers, worked out at nodes as they are needed and interpolated between them."""
+"""A slow function of one or two shape numbers, worked out at nodes as they are needed and interpolated between them.
+
+Lobes fall by decades from one exponent to the next, so logarithms are interpolated.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+FAINTEST = 1e-8
+"""Values far below this are as good as 0."""
+
 
 class Nodes:
-    """Cubic interpolation over the logarithms of shape numbers, smooth across nodes (Catmull and Rom 1974).
+    """Cubic interpolation of logarithms over the logarithms of shape numbers, smooth across nodes (Catmull and Rom 1974).
 
     Parameters
     ----------
     function : callable
-        Takes the numbers by name and returns an array, always of one shape.
+        Takes the numbers by name and returns an array, 0 or more, always of one shape.
     bounds : mapping of str to (float, float)
         Lowest and highest value of each number, above 0. Without any, the function is called as it is.
     ratio : mapping of str to float
@@ -27,7 +33,7 @@ class Nodes:
 
     def __init__(self, function: Callable[..., Array], bounds: Mapping[str, tuple[float, float]], ratio: Mapping[str, float]) -> None:
         self._function, self._known = function, dict[tuple[int, ...], Array]()
-        self._low, self._step, self._count = {}, {}, {}
+        self._bounds, self._low, self._step, self._count = dict(bounds), {}, {}, {}
         for name, (low, high) in bounds.items():
             count = max(3, math.ceil(math.log(high / low) / math.log(ratio[name]))) + 1
             self._low[name], self._count[name] = math.log(low), count
@@ -35,32 +41,38 @@ class Nodes:
 
     def __call__(self, **numbers: float) -> Array:
         """Interpolate; numbers outside their bounds are an error of the caller."""
+        if not self._low:
+            return self._function()
         corners = []
         for name, low in self._low.items():
             place = (math.log(numbers[name]) - low) / self._step[name]
             first = min(max(math.floor(place), 0), self._count[name] - 2)
             corners.append(_weights(first, place - first, self._count[name]))
         parts = [math.prod(w for _, w in chosen) * self._at(tuple(k for k, _ in chosen)) for chosen in itertools.product(*corners)]
-        return np.asarray(sum(parts[1:], parts[0]))
+        return np.exp(np.sum(parts, axis=0)) - FAINTEST
 
     def _at(self, node: tuple[int, ...]) -> Array:
         if node not in self._known:
-            values = {name: math.exp(self._low[name] + k * self._step[name]) for name, k in zip(self._low, node, strict=True)}
-            self._known[node] = self._function(**values)
+            values = {name: self._value(name, k) for name, k in zip(self._low, node, strict=True)}
+            self._known[node] = np.log(self._function(**values) + FAINTEST)
         return self._known[node]
+
+    def _value(self, name: str, k: int) -> float:
+        low, high = self._bounds[name]
+        return min(max(math.exp(self._low[name] + k * self._step[name]), low), high)  # rounding only
 
 
 def _weights(first: int, t: float, count: int) -> list[tuple[int, float]]:
-    """Nodes about a place between `first` and the next, and their weights; beyond the ends the row goes on straight."""
+    """Nodes about a place between `first` and the next, and their weights; beyond the ends the row goes on as a parabola."""
     inner = {
         first - 1: -t / 2 + t * t - t**3 / 2,
         first: 1 - 2.5 * t * t + 1.5 * t**3,
         first + 1: t / 2 + 2 * t * t - 1.5 * t**3,
         first + 2: (t**3 - t * t) / 2,
     }
-    for outside, edge, within in ((-1, 0, 1), (count, count - 1, count - 2)):
+    for outside, inward in ((-1, 1), (count, -1)):
         if outside in inner:
             weight = inner.pop(outside)
-            inner[edge] += 2 * weight
-            inner[within] -= weight
+            for step, share in ((1, 3), (2, -3), (3, 1)):
+                inner[outside + step * inward] += share * weight
     return list(inner.items())

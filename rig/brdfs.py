@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from fitting.fit import Fit
     from fitting.model import Model
-    from fitting.reflectance import Reflectance
+    from fitting.table import ReflectanceTable
 
 GRAZING_DEG = 89.99
 """Directions are moved down to this: along the surface itself the models have no value."""
@@ -23,8 +23,8 @@ GRAZING_DEG = 89.99
 def brdf_of(stored: StoredFit, workspace: Workspace, white: float | None) -> "Callable[[ArrayLike, ArrayLike, ArrayLike], NDArray[Any]]":
     """Return f(theta_i, theta_r, phi) in deg -> 1/sr.
 
-    The models with domes integrate over a dome for each direction, far too slowly for a file: their tables of all directions are taken, which
-    the workspace keeps. The others are `fitting.fit.Fit.brdf`.
+    The models with domes integrate over a dome for each direction, far too slowly for a file: their tables of all directions are taken,
+    which the workspace keeps. The others are `fitting.fit.Fit.brdf`.
 
     Parameters
     ----------
@@ -37,8 +37,6 @@ def brdf_of(stored: StoredFit, workspace: Workspace, white: float | None) -> "Ca
     ------
     ConfigError
         If it is missing, needless or not above 0.
-    EnergyError
-        If more light would be sent back than falls on the petal.
     """
     import numpy as np
 
@@ -74,18 +72,19 @@ def _paper(fit: "Fit", workspace: Workspace, per_white: float) -> Any:
     return f_r
 
 
-def _radiometric(fit: "Fit", workspace: Workspace, per_white: float) -> "Reflectance":
-    return _model("radiometric", fit, workspace).reflectance(**{name: x * per_white for name, x in fit.x.items()})
+def _radiometric(fit: "Fit", workspace: Workspace, per_white: float) -> Any:
+    return _mixed(_model("radiometric", fit, workspace).table, fit.x, per_white)
 
 
-def _interreflecting(fit: "Fit", workspace: Workspace, per_white: float) -> "Reflectance":
+def _interreflecting(fit: "Fit", workspace: Workspace, per_white: float) -> Any:
     """The fit's u_diff holds one factor of the albedo, which it does not take from its shape number."""
-    x, albedo = {name: value * per_white for name, value in fit.x.items()}, fit.shape["albedo"]
-    table, weights = _model("interreflecting", fit, workspace).parts(albedo=albedo, **{n: v for n, v in x.items() if n != "u_diff"})
-    return table.mixed({name: w * x["u_diff"] / albedo if name.startswith("order") else w for name, w in weights.items()})
+    albedo, others = fit.shape["albedo"], {name: x for name, x in fit.x.items() if name != "u_diff"}
+    table, weights = _model("interreflecting", fit, workspace).parts(albedo=albedo, **others)
+    first = fit.x["u_diff"] / albedo
+    return _mixed(table, {name: weight * (first if name.startswith("order") else 1) for name, weight in weights.items()}, per_white)
 
 
-def _body(fit: "Fit", workspace: Workspace, per_white: float) -> "Reflectance":
+def _body(fit: "Fit", workspace: Workspace, per_white: float) -> Any:
     """The fit has no light that strays within the domes, and two coefficients where the model has none."""
     from fitting.cells import Cell
     from fitting.ladder import LEFT, REFRACTION
@@ -93,7 +92,18 @@ def _body(fit: "Fit", workspace: Workspace, per_white: float) -> "Reflectance":
     model = stored_model(workspace, "body", Cell(fit.shape["aspect"]), n=REFRACTION)
     R_m = fit.shape["R_m"]
     table, weights = model.parts(mu=fit.shape["mu"], R_m=R_m, T_m=LEFT * (1 - R_m))
-    return table.mixed({name: fit.x.get(name, 0.0) * per_white for name in weights})
+    return _mixed(table, {name: fit.x.get(name, 0.0) for name in weights}, per_white)
+
+
+def _mixed(table: "ReflectanceTable", x: Mapping[str, float], per_white: float) -> Any:
+    """Mix, also what sends back more light than falls on it: a fit need not know better, and the command says so."""
+    share = max(sum(x.values()), 1.0)
+    part = table.mixed({name: weight / share for name, weight in x.items()})
+
+    def f_r(theta_i: Any, theta_r: Any, phi: Any) -> Any:
+        return part(theta_i, theta_r, phi) * (share * per_white)
+
+    return f_r
 
 
 def _model(mode: str, fit: "Fit", workspace: Workspace) -> "Model":

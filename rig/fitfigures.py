@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rig.figures import SIMULATED, TERM_STYLES, TERMS, polar_axes, round_up, saved_figure, towards_light
+from rig.fitreadings import Cut, Readings, curves, cuts_of, readings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,21 +19,15 @@ if TYPE_CHECKING:
     from fitting.compare import Comparison
     from fitting.fit import Fit
     from fitting.linear import Coefficient
-    from fitting.measurements import Measurements
 
 Array = NDArray[np.float64]
 Drawer = Callable[["Figure"], None]
 
-SAME = 0.5
-"""Readbacks of phi this near to one another are one plane, deg."""
-
 PANELS_POLAR, PANELS_CARTESIAN = 12, 6
 """So many panels to a figure; what is left goes on another."""
 
-NODES, NODES_TABULATED = 64, 12
-"""Of the integral over all views; the fewer reach to 84.5 deg, those models' tables to 85."""
-
-TABULATED = ("interreflecting", "body")
+EXACT = 0.01
+"""Errors below this, percent, are drawn as none: as many numbers as readings fit exactly."""
 
 CLAIMED = 10.0
 """The paper's E, percent, marked among the residuals."""
@@ -42,237 +37,11 @@ FITTED: dict[str, Any] = {"color": "#000000", "marker": "o", "markersize": 4.5, 
 HELD_OUT: dict[str, Any] = FITTED | {"markerfacecolor": "white"}
 MODEL: dict[str, Any] = {"color": "#D55E00", "linewidth": 1.5}
 FORETOLD: dict[str, Any] = {"color": "#0072B2", "linewidth": 1.2, "linestyle": "--", "marker": "x", "markersize": 4.5}
+
 ALL_TERMS = TERMS | {"diff": "diffuse", "spec": "mirror lobe", "mirror": "mirrored, by the domes", "body": "from within, the petal"}
 ALL_STYLES = TERM_STYLES | {
     name: TERM_STYLES[like] for name, like in (("diff", "u_diff"), ("spec", "u_spec"), ("mirror", "u_spec"), ("body", "s_diff"))
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Readings fitted and held out, one row each, in the quantity they were read in.
-
-    Attributes
-    ----------
-    theta_i_deg, theta_r_deg, phi_deg : ndarray, shape (n,), deg
-    value : ndarray, shape (n,)
-        In the unit of the readings.
-    modelled : ndarray, shape (n,)
-        By the fit; by the fit that foretold them where they were not fitted.
-    foretold : ndarray, shape (n,)
-        By a fit without the reading; NaN where there is none.
-    sigma : ndarray, shape (n,)
-        Standard uncertainty; NaN where the readings have none.
-    bar : ndarray, shape (n,)
-        Half length of an error bar: sigma, else the scatter of the fit's residuals; NaN where neither is known.
-    fitted : ndarray of bool, shape (n,)
-    what : ndarray of str, shape (n,)
-        Of the prediction; empty where there is none.
-    row : ndarray of int, shape (n,)
-        Line in the source, 0 where it is not known.
-    incidences : ndarray, deg
-    incidence_of : ndarray of int, shape (n,)
-        Index into `incidences`.
-    """
-
-    theta_i_deg: Array
-    theta_r_deg: Array
-    phi_deg: Array
-    value: Array
-    modelled: Array
-    foretold: Array
-    sigma: Array
-    bar: Array
-    fitted: NDArray[np.bool_]
-    what: NDArray[np.str_]
-    row: NDArray[np.int64]
-    incidences: Array
-    incidence_of: NDArray[np.int64]
-
-    @property
-    def residual(self) -> Array:
-        """Measured less modelled."""
-        return self.value - self.modelled
-
-    @property
-    def percent(self) -> Array:
-        """Residuals in percent of the readings; NaN at readings of 0 or less."""
-        return 100 * self.residual / self._above
-
-    @property
-    def E(self) -> Array:
-        """Eq. (13), percent; NaN at readings of 0 or less."""
-        return np.abs(self.percent)
-
-    @property
-    def E_foretold(self) -> Array:
-        """Eq. (13) of what was foretold, percent; NaN where nothing was."""
-        return 100 * np.abs(self.value - self.foretold) / self._above
-
-    @property
-    def _above(self) -> Array:
-        return np.where(self.value > 0, self.value, math.nan)
-
-
-@dataclass(frozen=True, eq=False)
-class Cut:
-    """Readings of one incidence along a line: in one plane by theta_r, or at one theta_r by phi.
-
-    Attributes
-    ----------
-    theta_i_deg : float
-    held : float
-        The phi of the plane, or the theta_r, deg.
-    by_phi : bool
-        Whether phi runs.
-    rows : ndarray of int
-        Of the `Readings`, in the order of the running angle.
-    """
-
-    theta_i_deg: float
-    held: float
-    by_phi: bool
-    rows: NDArray[np.int64]
-
-    @property
-    def in_plane(self) -> bool:
-        """Whether the line lies in the plane of incidence."""
-        return self.held == 0 and not self.by_phi
-
-    @property
-    def title(self) -> str:
-        """The angles that are held, as mathtext."""
-        light = f"$\\theta_i$ = {tenth(self.theta_i_deg)} deg"
-        held = "\\theta_r" if self.by_phi else "\\varphi"
-        return light if self.in_plane else f"{light}, ${held}$ = {tenth(self.held)} deg"
-
-    def angles(self, readings: Readings) -> Array:
-        """Return the running angle of the readings, deg."""
-        return (readings.phi_deg if self.by_phi else readings.theta_r_deg)[self.rows]
-
-    def fine(self, readings: Readings) -> Array:
-        """Return a grid over the readings' angles, a degree or less apart."""
-        run = self.angles(readings)
-        return np.linspace(run.min(), run.max(), max(2, math.ceil(np.ptp(run)) + 1))
-
-
-def readings_of(fit: "Fit") -> Readings:
-    """Put what was fitted and what was foretold into one table; a reading that was both is one row."""
-    m = fit.measurements
-    counts = _ones(fit, m.theta_i_deg, m.theta_r_deg, m.phi_deg).intensity
-    n, columns = len(m), {name: [np.asarray(getattr(m, name), float)] for name in ("theta_i_deg", "theta_r_deg", "phi_deg", "value")}
-    foretold, what, new = np.full(n, math.nan), np.full(n, "", dtype=object), []
-    for part in fit.predicted:
-        scale = _ones(fit, part.theta_i_deg, part.theta_r_deg, part.phi_deg).intensity
-        value, modelled = part.measured / scale, part.modelled / scale
-        own = _rows_of(m, part.theta_i_deg, part.theta_r_deg, part.phi_deg, value)
-        known = own >= 0
-        foretold[own[known]], what[own[known]] = modelled[known], part.what
-        for name, column in zip(columns, (part.theta_i_deg, part.theta_r_deg, part.phi_deg, value), strict=True):
-            columns[name].append(column[~known])
-        new.append((modelled[~known], part.what))
-    joined = {name: np.concatenate(parts) for name, parts in columns.items()}
-    extra = np.concatenate([modelled for modelled, _ in new]) if new else np.empty(0)
-    pooled = _ones(fit, joined["theta_i_deg"], joined["theta_r_deg"], joined["phi_deg"])
-    blank = np.full(extra.size, math.nan)
-    sigma = np.concatenate([np.full(n, math.nan) if m.sigma is None else np.asarray(m.sigma, float), blank])
-    return Readings(
-        **joined,
-        modelled=np.concatenate([fit.modelled / counts, extra]),
-        foretold=np.concatenate([foretold, extra]),
-        sigma=sigma,
-        bar=sigma if m.sigma is not None else _scatter(fit, joined["value"], pooled.intensity),
-        fitted=np.arange(n + extra.size) < n,
-        what=np.concatenate([what, *(np.full(modelled.size, name, dtype=object) for modelled, name in new)]).astype(str),
-        row=np.concatenate([np.asarray(m.rows, np.int64), np.zeros(extra.size, np.int64)]),
-        incidences=pooled.incidences,
-        incidence_of=pooled.incidence_of,
-    )
-
-
-def _rows_of(m: "Measurements", *columns: Array) -> NDArray[np.int64]:
-    """Find readings among those fitted: their rows, -1 where they are not; repeats are taken in turn."""
-    mine = (m.theta_i_deg, m.theta_r_deg, m.phi_deg, m.value)
-    free = np.ones(len(m), bool)
-    out = np.full(columns[0].size, -1)
-    for k in range(out.size):
-        same = free & np.all([np.isclose(a, b[k], rtol=1e-9, atol=1e-9) for a, b in zip(mine, columns, strict=True)], axis=0)
-        if same.any():
-            out[k] = np.flatnonzero(same)[0]
-            free[out[k]] = False
-    return out
-
-
-def _ones(fit: "Fit", theta_i_deg: Array, theta_r_deg: Array, phi_deg: Array) -> "Measurements":
-    """Readings of 1, of the fit's quantity."""
-    from fitting.measurements import Measurements
-
-    return Measurements(theta_i_deg, theta_r_deg, np.ones(np.size(theta_i_deg)), quantity=fit.measurements.quantity, phi_deg=phi_deg)
-
-
-def curves(fit: "Fit", cuts: Sequence[Cut], readings: Readings) -> dict[Cut, tuple[Array, Array]]:
-    """Return fine angles and the model there for cuts that were fitted.
-
-    An aperture makes the model slow. Its line is then an ideal detector's, and what the aperture adds, known at the readings, is put in
-    between them linearly: where there is a reading, the line is the model.
-    """
-    chosen = [cut for cut in cuts if np.any(readings.fitted[cut.rows])]
-    grids = [cut.fine(readings) for cut in chosen]
-    out = {}
-    for cut, grid, line in zip(chosen, grids, _ideal(fit, chosen, grids), strict=True):
-        if not fit.aperture.is_ideal:
-            rows = cut.rows[readings.fitted[cut.rows]]
-            angles = (readings.phi_deg if cut.by_phi else readings.theta_r_deg)[rows]
-            (bare,) = _ideal(fit, [cut], [angles])
-            line = line + np.interp(grid, angles, readings.modelled[rows] - bare)
-        out[cut] = grid, line
-    return out
-
-
-def _ideal(fit: "Fit", cuts: Sequence[Cut], grids: Sequence[Array]) -> list[Array]:
-    """Evaluate the model along cuts as an ideal detector reads it, in the readings' quantity; all at once."""
-    if not cuts:
-        return []
-    held = [np.full(grid.size, cut.held) for cut, grid in zip(cuts, grids, strict=True)]
-    theta_r = np.concatenate([hold if cut.by_phi else grid for cut, grid, hold in zip(cuts, grids, held, strict=True)])
-    phi = np.concatenate([grid if cut.by_phi else hold for cut, grid, hold in zip(cuts, grids, held, strict=True)])
-    theta_i = np.concatenate([np.full(grid.size, cut.theta_i_deg) for cut, grid in zip(cuts, grids, strict=True)])
-    line = fit.predict(theta_i, theta_r, phi) / _ones(fit, theta_i, theta_r, phi).intensity
-    return np.split(line, np.cumsum([grid.size for grid in grids])[:-1])
-
-
-def _scatter(fit: "Fit", value: Array, counts: Array) -> Array:
-    """Standard deviation of the residuals as the weights see them, in the unit of the readings; NaN where it is not known."""
-    scale = math.nan if fit.linear.scale is None else fit.linear.scale
-    if fit.weights == "relative":
-        return scale * np.abs(value)
-    return scale / counts if fit.weights == "plain" else np.full(value.size, math.nan)
-
-
-def cuts_of(readings: Readings) -> list[Cut]:
-    """Sort the readings into lines: in plane first, then out of the plane along whichever angle needs fewer lines."""
-    cuts = []
-    for k, theta_i in enumerate(readings.incidences.tolist()):
-        here = np.flatnonzero(readings.incidence_of == k)
-        inside, outside = here[readings.phi_deg[here] == 0], here[readings.phi_deg[here] != 0]
-        if inside.size:
-            cuts.append(Cut(theta_i, 0.0, False, inside[np.argsort(readings.theta_r_deg[inside], kind="stable")]))
-        by_theta, by_phi = (_alike(angle[outside]) for angle in (readings.phi_deg, readings.theta_r_deg))
-        runs_phi = len(by_phi) < len(by_theta)
-        running = readings.phi_deg if runs_phi else readings.theta_r_deg
-        for held, members in by_phi if runs_phi else by_theta:
-            rows = outside[members]
-            cuts.append(Cut(theta_i, held, runs_phi, rows[np.argsort(running[rows], kind="stable")]))
-    return cuts
-
-
-def _alike(angles: Array) -> list[tuple[float, NDArray[np.int64]]]:
-    """Group angles that are one readback: their mean, and which they are."""
-    if not angles.size:
-        return []
-    order = np.argsort(angles, kind="stable")
-    groups = np.split(order, 1 + np.flatnonzero(np.diff(angles[order]) > SAME))
-    return [(round(float(angles[group].mean()), 3) + 0.0, group) for group in groups]
 
 
 def draw_fit(fit: "Fit", folder: Path, *, label: str = "", simulated: bool = False, comparison: "Comparison | None" = None) -> list[Path]:
@@ -323,11 +92,6 @@ def model_title(name: str) -> str:
     return RUNGS[name].title if name in RUNGS else name
 
 
-def tenth(angle: float) -> str:
-    """Return an angle in deg to a tenth, as people say it."""
-    return f"{round(angle, 1) + 0.0:g}"
-
-
 def percent(E: float | None) -> str:
     """Return an error in percent; a dash where there is none."""
     if E is None or not math.isfinite(E):
@@ -343,7 +107,8 @@ def unit_of_coefficients(fit: "Fit") -> str:
 def reading_words(fit: "Fit") -> tuple[str, str]:
     """Return what a reading is, and its unit, empty where it has none."""
     words = {"intensity": "reading", "reflectance-factor": "reflectance factor", "brdf": "BRDF"}
-    return words.get(fit.quantity, fit.quantity), "" if fit.unit in ("1", "") else fit.unit
+    what = "relative reading" if fit.unit == "relative" else words.get(fit.quantity, fit.quantity)
+    return what, "" if fit.unit in ("1", "relative") else fit.unit
 
 
 def bars_mean(fit: "Fit") -> str:
@@ -419,7 +184,7 @@ class _Scene:
 
 
 class _Polar:
-    """The paper's figures 8 and 9: one half disc an incidence, all on one scale."""
+    """The paper's figures 8 and 9: one half disc an incidence, all of a sheet on one scale."""
 
     TOP, FOOT = 0.6, 0.35
 
@@ -447,9 +212,7 @@ class _Polar:
             towards_light(axes, cut.theta_i_deg)
             scene.draw(axes, cut, np.radians(cut.angles(readings)), np.radians, 3.5, 0)
             axes.set_rlim(0, scale)
-            if len(self.cuts) > 1:
-                place = ((left + self.side / 2) / width, (bottom - 0.38) / height)
-                figure.text(*place, scene.heading(cut), ha="center", va="center")
+            figure.text((left + self.side / 2) / width, (bottom - 0.38) / height, scene.heading(cut), ha="center", va="center")
         _headed(figure, scene.title, 55 if self.columns == 1 else 100)
         scene.legend(figure, 0.4, 2 if self.columns == 1 else 4)
         what, unit = reading_words(scene.fit)
@@ -673,18 +436,8 @@ def term_label(name: str) -> str:
 
 
 def reflectances_of(fit: "Fit") -> dict[str, tuple[float, float, float]] | None:
-    """Return each term as a reflectance at normal incidence with its 95 % interval; None for relative readings, whose scale is not known.
-
-    The reflectance of a term is its integral over sin^2(theta_r), being pi f_r cos(theta_i) on the scale that is fitted.
-    """
-    from fitting.ladder import Directions
-
-    if fit.quantity == "intensity":
-        return None
-    z, w = np.polynomial.legendre.leggauss(NODES_TABULATED if fit.model in TABULATED else NODES)
-    views = np.degrees(np.arcsin(np.sqrt((z + 1) / 2)))
-    unit = w / 2 @ fit.rung.design(Directions.of(0.0, views), fit.shape, fit.traces)
-    return fit.linear.reflectances(unit) if np.all(unit > 0) else None
+    """Return each term as a reflectance with its 95 % interval; None for relative readings, whose scale is not known."""
+    return None if fit.quantity == "intensity" else fit.reflectances()
 
 
 class _Ladder:
@@ -717,7 +470,7 @@ class _Ladder:
         fitted, left_out = (
             [math.nan if v is None else v for v in column] for column in zip(*((r.E_mean, r.left_out) for r in rows), strict=True)
         )
-        there = [v for v in (*fitted, *left_out) if math.isfinite(v) and v > 0]
+        there = [v for v in (*fitted, *left_out) if v >= EXACT]
         log = bool(there) and max(there) > 20 * min(there)
         if log:
             axes.set_xscale("log")
@@ -731,11 +484,18 @@ class _Ladder:
         ):
             if not np.any(np.isfinite(values)):
                 continue
-            axes.barh(places + offset, [v - floor if math.isfinite(v) else 0.0 for v in values], 0.34, left=floor, **style, label=name)
+            axes.barh(
+                places + offset, [max(v, floor) - floor if math.isfinite(v) else 0.0 for v in values], 0.34, left=floor, **style, label=name
+            )
             for place, value in zip(places, values, strict=True):
                 if math.isfinite(value):
                     axes.annotate(
-                        f"{value:.3g}", (value, place + offset), textcoords="offset points", xytext=(3, 0), va="center", fontsize=7
+                        f"{value:.3g}" if value >= EXACT else "0",
+                        (max(value, floor), place + offset),
+                        textcoords="offset points",
+                        xytext=(3, 0),
+                        va="center",
+                        fontsize=7,
                     )
         for place, row in zip(places, rows, strict=True):
             if row.problem:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rig.errors import ConfigError, RunError
-from rig.fits import StoredFit, measurements_of, new_fit, provenance_of_run
+from rig.fits import StoredFit, measurements_of, new_fit, provenance_of_file, provenance_of_run
 from rig.runs import Run, list_runs
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ class Specimen:
         See `StoredFit`.
     measurements : Measurements
     others : tuple of (str, Measurements)
-        Readings at other incidences, to predict: where they come from, and what they are.
+        Readings to predict: where they come from, and what they are.
     """
 
     label: str
@@ -88,6 +88,20 @@ def specimen_of_runs(runs: Sequence[Run], all_runs: Path) -> Specimen:
     return Specimen(first.cultivar, first.simulated, {"run": ", ".join(ids), "runs": parts}, together(readings))
 
 
+def specimen_of_table(path: Path, measurements: "Measurements", most: int, seed: int) -> Specimen:
+    """Take a table, or of a long one so many readings, drawn evenly at random; the others are there to be predicted."""
+    import numpy as np
+
+    label = "".join(c if c.isalnum() or c == "-" else "-" for c in path.stem) or "table"
+    provenance = provenance_of_file(path)
+    if len(measurements) <= most:
+        return Specimen(label, False, provenance, measurements)
+    drawn = np.zeros(len(measurements), bool)
+    drawn[np.random.default_rng(seed).choice(len(measurements), most, replace=False)] = True
+    others = (f"the {np.count_nonzero(~drawn)} readings not drawn", measurements.take(~drawn))
+    return Specimen(label, False, provenance | {"drawn": most, "of": len(measurements), "seed": seed}, measurements.take(drawn), (others,))
+
+
 def together(tables: "Sequence[Measurements]") -> "Measurements":
     """Put tables of one quantity and unit below one another; raise RunError where they differ in these."""
     import numpy as np
@@ -122,7 +136,7 @@ def _others(run: Run, readings: "Measurements", all_runs: Path) -> "tuple[tuple[
             continue  # a damaged run must not hinder the fit of a good one
         for k, theta_i in enumerate(m.incidences.tolist()):
             if abs(theta_i - readings.incidences[0]) > 1 and not any(abs(theta_i - known) <= 1 for known in found):
-                found[theta_i] = (f"{theta_i:g} deg, run {other.id}", m.take(m.incidence_of == k))
+                found[theta_i] = (f"{round(theta_i, 1):g} deg, run {other.id}", m.take(m.incidence_of == k))
     return tuple(found[theta_i] for theta_i in sorted(found))
 
 

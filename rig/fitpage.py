@@ -13,19 +13,8 @@ import numpy as np
 from rig.errors import RunError
 from rig.figures import SIMULATED
 from rig.files import write_atomically
-from rig.fitfigures import (
-    ALL_TERMS,
-    Readings,
-    bars_mean,
-    draw_fit,
-    model_title,
-    percent,
-    reading_words,
-    readings_of,
-    reflectances_of,
-    tenth,
-    unit_of_coefficients,
-)
+from rig.fitfigures import ALL_TERMS, bars_mean, draw_fit, model_title, percent, reading_words, reflectances_of, unit_of_coefficients
+from rig.fitreadings import Readings, readings_of, tenth
 
 if TYPE_CHECKING:
     from fitting.compare import Comparison, RungResult
@@ -73,13 +62,16 @@ h1 { font-size: 1.6rem; margin: 0 0 .3rem } h2 { font-size: 1.15rem; margin: 2re
 .result { font-size: 1.1rem } figure { margin: 1.2rem 0; break-inside: avoid } figure svg { max-width: 100%; height: auto }
 figcaption { color: #333; font-size: .9rem } table { border-collapse: collapse; margin: .6rem 0; font-variant-numeric: tabular-nums }
 th, td { padding: .18rem .7rem; text-align: right; border-bottom: 1px solid #ddd; vertical-align: top }
+td { white-space: nowrap } td.words { white-space: normal; min-width: 6rem }
 th { border-bottom: 1px solid #333; background: #f4f4f4 } td:first-child, th:first-child, td.words, th.words { text-align: left }
 thead { display: table-header-group } tr { break-inside: avoid } .wide { overflow-x: auto } tr.out td { color: #0a4f86; font-style: italic }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: .6rem 0 } dt { color: #444 }
 dd { margin: 0; overflow-wrap: anywhere }
 blockquote { margin: .6rem 0; padding: .7rem 1rem; background: #f6f6f6; border-left: 4px solid #555; user-select: all }
-@media print { body { font-size: 10.5pt; max-width: none; margin: 0 } h2 { break-after: avoid } a { color: inherit } }
+@media print { body { font-size: 10pt; max-width: none; margin: 0; padding: 0 } table { font-size: 8.5pt } h2 { break-after: avoid } }
 """
+STAMP = "@page { @top-right { content: '%s'; color: #b00000; font: bold 11pt Arial, sans-serif } }"
+"""Puts a mark on every printed sheet."""
 
 
 def write_page(stored: "StoredFit", folder: Path, comparison: "Comparison | None" = None) -> Path:
@@ -112,14 +104,18 @@ def result(stored: "StoredFit") -> str:
     """Return the outcome in one sentence, with whatever stands against it."""
     fit = stored.fit
     size = f"mean E {percent(fit.E_mean)}, at most {percent(fit.E_max)}"
-    what = f"Model {model_title(fit.model)}: {size}, over {_count(len(fit), 'reading')} of {stored.label}"
+    what = f"Model \u201c{model_title(fit.model)}\u201d: {size}, over {_count(len(fit), 'reading')} of {stored.label}"
     against = []
     if not fit.converged:
         against.append("the search for its shape did NOT converge")
     if fit.at_bounds:
         against.append(f"{_listed(list(fit.at_bounds))} ended at a bound")
-    if loose := fit.linear.undetermined:
+    if loose := [name for name in fit.searched if fit.shape_sigma.get(name) is None and name not in fit.at_bounds]:
+        against.append(f"the readings do not tell how far {_listed(loose)} can be trusted")
+    if loose := list(fit.linear.undetermined):
         against.append(f"{_listed([_plain_symbol(name) for name in loose])} {'is' if len(loose) == 1 else 'are'} NOT determined")
+    if any(fit.linear[a].determined and fit.linear[b].determined for a, b, _ in fit.linear.alike):
+        against.append("some coefficients are hard to tell apart")
     if misfits(fit):
         against.append("the misfit is larger than the readings' uncertainty, which the intervals leave out")
     return what + (f"; but {_listed(against)}." if against else "; all its coefficients are determined.")
@@ -208,7 +204,9 @@ def _page(stored: "StoredFit", pictures: Sequence[Path], comparison: "Comparison
     mark = f"{SIMULATED}: " if stored.simulated else ""
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<meta name="viewport" content="width=device-width">\n'
-        f"<title>{_e(mark + title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
+        f"<title>{_e(mark + title)}</title>\n<style>{STYLE}{STAMP % SIMULATED if stored.simulated else ''}</style>\n</head>\n<body>\n"
+        + "\n".join(parts)
+        + "\n</body>\n</html>\n"
     )
 
 
@@ -287,8 +285,8 @@ def _shape(fit: "Fit") -> str:
 def _search(fit: "Fit") -> str:
     if fit.search is None:
         return "<p>Nothing was searched for: given the shape, the coefficients follow by linear least squares.</p>"
-    state = "Converged" if fit.converged else "<span class=warn>NOT converged</span>"
-    return f"<p>{state}: {'<br>'.join(_e(line) for line in fit.search.splitlines())}</p>"
+    lines = "<br>".join(_e(line) for line in fit.search.splitlines())
+    return f"<p>{lines}</p>" if fit.converged else f"<p class=warn>NOT converged: {lines}</p>"
 
 
 def _quality(fit: "Fit") -> str:
@@ -334,7 +332,7 @@ def _ladder(comparison: "Comparison") -> str:
         "AICc",
         "remark",
     ]
-    said = "".join(f"<p>{_e(line)}</p>" for line in comparison.statement.splitlines())
+    said = "".join(f"<p>{_e(line[:1].upper() + line[1:])}.</p>" for line in comparison.statement.splitlines())
     return said + _table(header, rows, words=("remark",)) + _left_out(comparison)
 
 
@@ -379,15 +377,17 @@ def _errors(fit: "Fit", readings: Readings) -> str:
     columns["E, %"] = [_fixed(value, ".2f") for value in readings.E]
     if fit.predicted:
         columns["predicted: E, %"] = [_fixed(value, ".2f") for value in readings.E_foretold]
-        columns["predicted as"] = [_e(name) for name in readings.what]
+    if not np.all(readings.fitted):
         columns["fitted"] = ["yes" if fitted else "no" for fitted in readings.fitted]
     kinds = ["" if fitted else "out" for fitted in readings.fitted]
-    return _table(list(columns), zip(*columns.values(), strict=True), kinds, words=("predicted as", "fitted"))
+    return _table(list(columns), zip(*columns.values(), strict=True), kinds, words=("fitted",))
 
 
 def _figure(svg: Path, stored: "StoredFit") -> str:
     kind = re.sub(r"-\d+$", "", svg.stem)
     text = f"{SIMULATED}. {FIGURES[kind]}" if stored.simulated else FIGURES[kind]
+    if kind in ("polar", "cartesian") and stored.fit.predicted:
+        text += ". Filled marks: readings that were fitted; open: not fitted; crosses, dashed: what fits without these readings predict"
     if kind == "cartesian" and (bars := bars_mean(stored.fit)):
         text += f". Error bars: {bars}"
     return f"<figure>{_inline(svg, text)}<figcaption>{_e(text)}.</figcaption></figure>"
@@ -462,8 +462,8 @@ def _quoted(c: "Coefficient", unit: str) -> str:
 
 def _shape_words(fit: "Fit", name: str) -> str:
     error = fit.shape_sigma.get(name)
-    spread = "" if error is None else f" \N{PLUS-MINUS SIGN} {_number(error)}"
     bound = ", at its bound" if name in fit.at_bounds else ""
+    spread = f" \N{PLUS-MINUS SIGN} {_number(error)}" if error is not None else "" if bound else " (without standard error)"
     return f"{_shape_meaning(fit.model, name)} {name} = {_number(fit.shape[name])}{spread}{bound}"
 
 

@@ -12,7 +12,7 @@ from fitting.ablation import READ, Step, ablation
 from fitting.model import Model, cell_of
 from fitting.reflectance import INTENSITY
 from rig.cellfigure import draw_cell
-from rig.figures import SPEC_ENLARGED, TERM_STYLES, TERMS, polar_axes, saved_figure, towards_light
+from rig.figures import SPEC_ENLARGED, TERM_STYLES, TERMS, polar_axes, round_up, saved_figure, towards_light
 from rig.models import PETAL
 
 if TYPE_CHECKING:
@@ -187,14 +187,6 @@ def _shape(model: Model) -> str:
     return words + ("" if cell.is_ellipsoid else f", p {cell.p:g}, q {cell.q:g}") + (f", gap {cell.gap:g}" if cell.gap else "")
 
 
-def _round_up(value: float) -> float:
-    """Return the next round number that is round in quarters, too."""
-    if value <= 0:
-        return 1.0
-    power = 10.0 ** math.floor(math.log10(value))
-    return next(step * power for step in (1, 1.2, 1.6, 2, 2.4, 3.2, 4, 6, 8, 10) if step * power >= value * 0.999)
-
-
 def _lobes(figure: "Figure", model: Model, numbers: Mapping[str, float], theta_i: float) -> None:
     """Figure 6: the terms by themselves, in plane."""
     fine = np.arange(-89.0, 89.5, 1.0)
@@ -217,7 +209,7 @@ def _lobes(figure: "Figure", model: Model, numbers: Mapping[str, float], theta_i
             enlarged = 1.0 if name == "body" else SPEC_ENLARGED
             values = enlarged * table.alone(name)(theta_i, fine, 0.0)
             curves.append((f"{text}{f' (x{enlarged:g})' if enlarged != 1 else ''}", values, part))
-    scale = _round_up(max(float(np.max(values[np.abs(fine) <= READ])) for _, values, _ in curves))
+    scale = round_up(max(float(np.max(values[np.abs(fine) <= READ])) for _, values, _ in curves))
     cut = any(float(np.max(values)) > scale for _, values, _ in curves)
     axes = polar_axes(figure, 0.6, 0.7, figure.get_size_inches()[0] - 1.2, scale)
     towards_light(axes, theta_i)
@@ -242,7 +234,7 @@ def _polar(figure: "Figure", mixed: "Reflectance", below: "Reflectance | None", 
     # Grazing mirror light would dwarf the rest: the scale is that of the views people read.
     read = np.abs(fine) <= READ
     curves = (*above.values(), *through.values())
-    scale = _round_up(max(float(values[read].max()) for values in curves))
+    scale = round_up(max(float(values[read].max()) for values in curves))
     cut = any(float(values.max()) > scale for values in curves)
     for left, (name, _) in zip((0.5, 5.45), planes.items(), strict=True):
         axes = polar_axes(figure, left, 0.85, 4.05, scale, whole=below is not None)
@@ -295,10 +287,10 @@ def _solid(figure: "Figure", mixed: "Reflectance", below: "Reflectance | None", 
         axes.set(xlim=(-wide, wide), ylim=(-wide, wide), zlim=(low, high))
         axes.set_box_aspect((2 * wide, 2 * wide, high - low), zoom=0.95)
         axes.view_init(elev=22, azim=-62)
-        step = _round_up(wide / 2.1)
+        step = round_up(wide / 2.1)
         for axis in (axes.set_xticks, axes.set_yticks):
             axis([-step, 0, step], [f"{-step:g}", "0", f"{step:g}"])
-        step = _round_up(high / 1.6)
+        step = round_up(high / 1.6)
         heights = [0, step] if below is None else [-step, 0, step]
         axes.set_zticks([h for h in heights if low <= h <= high], [f"{h:g}" for h in heights if low <= h <= high])
         axes.set_xlabel("x, on the light's side")
@@ -358,9 +350,9 @@ def _ablation(figure: "Figure", found: Ablation) -> None:
     figure.subplots_adjust(left=0.25, right=0.8, top=1 - 0.85 / height, bottom=0.5 / height, hspace=0.28, wspace=0.24)
     grid[0, 0].set_title(_symbol(found))
     grid[0, 1].set_title("over its value at $\\theta_r$ = 0")
-    most = _round_up(1.02 * max(float(step.values.max()) for step in found.steps))
+    most = round_up(1.02 * max(float(step.values.max()) for step in found.steps))
     shapes = [step.normalised for step in found.steps]
-    most_shape = min(4.0, _round_up(1.02 * max((float(shape.max()) for shape in shapes if shape is not None), default=1.0)))
+    most_shape = min(4.0, round_up(1.02 * max((float(shape.max()) for shape in shapes if shape is not None), default=1.0)))
     for n, step in enumerate(found.steps):
         before = found.steps[0 if found.leaves_out else max(0, n - 1)]
         for axes, of, top in ((grid[n, 0], lambda s: s.values, most), (grid[n, 1], lambda s: s.normalised, most_shape)):
@@ -399,7 +391,7 @@ def _modes(figure: "Figure", cultivars: Mapping[str, tuple[Model, Mapping[str, f
     for mode, mixed in mixtures.items():
         lit = math.cos(math.radians(theta_i)) if mixed.mode == INTENSITY else 1.0
         curves[mode] = math.pi * mixed(theta_i, fine, 0.0) / lit / float(mixed.albedo(theta_i))
-    scale = _round_up(max(float(curve.max()) for curve in curves.values()))
+    scale = round_up(max(float(curve.max()) for curve in curves.values()))
     axes = polar_axes(figure, 0.45, 1.65, 4.9, scale)
     towards_light(axes, theta_i)
     right = figure.add_axes((0.625, 0.34, 0.35, 0.52))

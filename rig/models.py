@@ -13,6 +13,7 @@ from rig.workspace import Workspace
 
 if TYPE_CHECKING:
     from fitting.cells import Cell
+    from fitting.ladder import Traces
     from fitting.model import Model
 
 PETAL: Mapping[str, Mapping[str, float]] = {
@@ -56,13 +57,25 @@ def stored_model(workspace: Workspace, mode: str, cell: "Cell", **settings: Any)
 
 def model_path(workspace: Workspace, mode: str, cell: "Cell", **settings: Any) -> Path:
     """Return where the model of a geometry lies, named for its mode and the sum of what it depends on: settings, and fitting's own code."""
+    of = _plain({"mode": mode, "cell": cell} | used(mode, settings))
+    return workspace.models / f"{mode}-{_digest(json.dumps(of, sort_keys=True))}.npz"
+
+
+def kept_traces(workspace: Workspace) -> "Traces":
+    """Return what fits trace, kept in the workspace for this version of the code."""
+    from fitting.ladder import Traces
+
+    return Traces(workspace.models / f"traces-{_digest('traces')}")
+
+
+def _digest(of: str) -> str:
+    """Name something made by fitting's code as it is now."""
     import fitting
 
-    of = _plain({"mode": mode, "cell": cell} | used(mode, settings))
-    digest = hashlib.sha256(json.dumps(of, sort_keys=True).encode())
+    digest = hashlib.sha256(of.encode())
     for source in sorted(Path(fitting.__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
-    return workspace.models / f"{mode}-{digest.hexdigest()[:12]}.npz"
+    return digest.hexdigest()[:12]
 
 
 def used(mode: str, settings: Mapping[str, Any]) -> dict[str, Any]:

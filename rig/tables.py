@@ -36,7 +36,7 @@ def fit_table(stored: StoredFit) -> str:
         lines.append(f"{theta_i:>9.2f} {theta_r:>9.2f} {azimuth}{measured:>11.4g} {modelled:>11.4g} {E:>7.2f}")
     lines += [
         "",
-        f"E: mean {fit.E_mean:.2f} %, maximum {fit.E_max:.2f} %; cosine-weighted error {fit.linear.cosine_rmse or 0:.4g} {fit.unit}",
+        f"E: mean {fit.E_mean:.2f} %, maximum {fit.E_max:.2f} %; cosine-weighted error {_in_unit(fit.linear.cosine_rmse, fit.unit)}",
     ]
     lines += [f"predicted {p.what}: E mean {_percent(p.E_mean)}, maximum {_percent(p.E_max)}" for p in fit.predicted]
     told = len(fit.linear.coefficients)  # the table above has them already
@@ -63,6 +63,10 @@ def comparison_table(comparison: "Comparison") -> str:
         lines.append(f"{row.title:<28}{row.parameters:>8}{errors}{rmse:>11}{chi2:>10}{aicc:>9}{_percent(row.left_out):>10}{mark}")
     left_out = "left out: mean E of each incidence by a fit to the others"
     return "\n".join([*lines, f"AICc above the lowest; {left_out}; *: supported", "", comparison.statement])
+
+
+def _in_unit(value: float | None, unit: str) -> str:
+    return "-" if value is None else f"{value:.4g}" + ("" if unit == "1" else f" {unit}")
 
 
 def _percent(value: float | None) -> str:

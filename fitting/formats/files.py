@@ -18,7 +18,7 @@ from fitting.formats.klems import read_klems, write_klems
 from fitting.formats.merl import BINS, RGB, Merl, read_merl, write_merl
 from fitting.formats.pab import XYZ, read_pab, write_pab
 from fitting.formats.rgl import MAGIC, Rgl, read_rgl, write_rgl
-from fitting.formats.table_csv import read_table, write_csv
+from fitting.formats.table_csv import ANGLES, read_table, write_csv
 from fitting.formats.zemax import write_zemax
 from fitting.progress import Progress, silent
 
@@ -116,7 +116,7 @@ def format_named(path: Path | str) -> str | None:
 def _by_content(head: bytes) -> str | None:
     if head.startswith(MAGIC):
         return "rgl"
-    if head[:12] == struct.pack("<3i", *BINS)[: len(head)]:
+    if head.startswith(struct.pack("<3i", *BINS)):
         return "merl"
     if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"<") or head.startswith((b"\xff\xfe<", b"\xfe\xff\0<")):
         return "klems"
@@ -178,7 +178,7 @@ def _read_csv(path: Path | str) -> Scattered:
     from fitting.measurements import read_csv
 
     header = next(iter(_cells(path)), [])
-    if "phi_i_deg" in header and "phi_r_deg" in header:
+    if set(ANGLES) <= set(header) and any(name.startswith(("brdf", "btdf")) for name in header):
         return read_table(path)
     found = read_csv(path)
     if found.quantity == "intensity":
@@ -294,12 +294,12 @@ def write_any(
         raise DomainError(f"{said}; known are {known()}")
     if channel is not None and not isinstance(data, Data):
         raise DomainError(f"channel {channel!r} cannot be chosen of what has but one")
-    if isinstance(data, Scattered | Brdf | Rgl) and channel is not None:
-        data, channel = picked(data, channel), None
-    _check_channels(kind, (channel,) if channel is not None else channel_names(data) if callable(data) else data.channels)
+    if channel is not None:
+        data = picked(data, channel)
+    _check_channels(kind, channel_names(data) if callable(data) else data.channels)
     if FORMATS[kind].hemisphere:
-        return _write_hemisphere(Path(path), data, kind, channel, beyond, name, progress)
-    return _write_list(Path(path), data, kind, channel, axes, name)
+        return _write_hemisphere(Path(path), data, kind, beyond, name, progress)
+    return _write_list(Path(path), data, kind, axes, name)
 
 
 def _check_channels(kind: str, channels: tuple[str, ...]) -> None:
@@ -320,9 +320,7 @@ def wavelengths(channels: Sequence[str]) -> list[float] | None:
     return found if found and len(found) == len(channels) and found == sorted(set(found)) else None
 
 
-def _write_hemisphere(
-    path: Path, data: Data | Function, kind: str, channel: str | None, beyond: Beyond, name: str, progress: Progress
-) -> Written:
+def _write_hemisphere(path: Path, data: Data | Function, kind: str, beyond: Beyond, name: str, progress: Progress) -> Written:
     notes: list[str] = []
     function: Function = data  # type: ignore[assignment]
     if isinstance(data, Scattered):
@@ -335,7 +333,7 @@ def _write_hemisphere(
         if (count := data.metadata["azimuths"]) > 1:
             notes.append(f"isotropic: the mean over {count} azimuths of the light")
     if isinstance(data, Brdf | Merl | Rgl):
-        function = whole = Whole(data, beyond, channel)
+        function = whole = Whole(data, beyond)
         if whole.azimuths > 1:
             notes.append(f"isotropic: the mean over {whole.azimuths} azimuths of the light")
         notes += _beyond(whole, holes(data) if isinstance(data, Merl) else 0, kind)
@@ -347,7 +345,7 @@ def _write_hemisphere(
     if kind == "merl":
         if not isinstance(data, Merl):
             notes.append("light and view are taken to be exchangeable: the mean of both ways")
-        write_merl(path, whole.table if isinstance(data, Merl) and channel is None and beyond != "zero" else function)
+        write_merl(path, whole.table if isinstance(data, Merl) and beyond != "zero" else function)
     elif kind == "rgl":
         write_rgl(path, function, wavelengths_nm=waves if waves and len(waves) > 1 else None, description=source)
     elif kind == "klems":
@@ -371,11 +369,11 @@ def _beyond(whole: Whole, holes: int, kind: str) -> list[str]:
     return [f"{holes} bins without a value, {does}"] if holes and whole.beyond != "refuse" else []
 
 
-def _write_list(path: Path, data: Data | Function, kind: str, channel: str | None, axes: Sequence[Array], name: str) -> Written:
+def _write_list(path: Path, data: Data | Function, kind: str, axes: Sequence[Array], name: str) -> Written:
     notes = []
     if not isinstance(data, Scattered | Brdf):
         notes.append(f"looked up at {' x '.join(str(len(axis)) for axis in axes)} directions (theta_i, theta_r, phi)")
-    listed = listed_of(data, axes, channel) if isinstance(data, Merl | Rgl) else data
+    listed = listed_of(data, axes) if isinstance(data, Merl | Rgl) else data
     if not isinstance(listed, Scattered | Brdf):
         listed = Brdf.sampled(listed, *axes, channels=channel_names(listed), source=name or "function")
     if isinstance(listed, Scattered):
@@ -396,7 +394,7 @@ def _write_list(path: Path, data: Data | Function, kind: str, channel: str | Non
     return Written((path,), kind, tuple(notes))
 
 
-def listed_of(table: Merl | Rgl, axes: Sequence[Array] = AXES, channel: str | None = None) -> Scattered:
+def listed_of(table: Merl | Rgl, axes: Sequence[Array] = AXES) -> Scattered:
     """Look a table up direction by direction, for each of the light's azimuths; directions without a value are left out.
 
     Raises
@@ -412,5 +410,4 @@ def listed_of(table: Merl | Rgl, axes: Sequence[Array] = AXES, channel: str | No
     theta_i, phi_i, theta_r, phi = (at[known] for at in (theta_i, phi_i, theta_r, phi))
     values = table.evaluate(theta_i, phi_i, theta_r, phi_i + phi) if isinstance(table, Rgl) else table(theta_i, theta_r, phi)
     about = {"left_out": int(np.count_nonzero(~known))}
-    found = Scattered(theta_i, phi_i, theta_r, phi_i + phi, values=values, channels=table.channels, source=table.source, metadata=about)
-    return found if channel is None else picked(found, channel)
+    return Scattered(theta_i, phi_i, theta_r, phi_i + phi, values=values, channels=table.channels, source=table.source, metadata=about)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fitting.errors import DomainError
 from fitting.formats.grid import Array, Brdf, Function, Quantity, Scattered
-from fitting.formats.merl import BINS, RGB, Merl, directions
+from fitting.formats.merl import BINS, Merl, directions
 from fitting.formats.rgl import FLATTEST_DEG, Rgl
 
 Beyond = Literal["refuse", "nearest", "zero"]
@@ -40,13 +40,13 @@ def gridded(data: Scattered) -> Brdf:
     ----------
     data : Scattered
         At every pair of a theta_i and a theta_r, azimuths all around, or from 0 to 180 deg, at most `WIDEST_GAP_DEG` apart; where either
-        theta is 0, one is enough.
+        theta is 0, one is enough. This holds for each azimuth of the light.
 
     Returns
     -------
     Brdf
-        Without the uncertainties. Its metadata's "azimuths" counts the light's azimuths that were averaged, and "filled_in" says whether
-        values had to be interpolated, straight along phi, because not every pair has the same azimuths.
+        Without the uncertainties; the mean over the light's azimuths, which its metadata's "azimuths" counts. "filled_in" says whether
+        values had to be interpolated, straight along phi, because azimuths differ from pair to pair.
 
     Raises
     ------
@@ -55,25 +55,29 @@ def gridded(data: Scattered) -> Brdf:
     """
     theta_i, i = np.unique(np.round(data.theta_i_deg, DIGITS), return_inverse=True)
     theta_r, r = np.unique(np.round(data.theta_r_deg, DIGITS), return_inverse=True)
-    phi = np.round((data.phi_r_deg - data.phi_i_deg) % 360, DIGITS) % 360
+    phi = _azimuths(data.phi_r_deg - data.phi_i_deg)
     pair = i * len(theta_r) + r
-    there, first = np.unique(pair, return_index=True)
+    there = np.unique(pair)
     if len(there) < len(theta_i) * len(theta_r):
-        k = int(np.setdiff1d(np.arange(len(theta_i) * len(theta_r)), there)[0])
+        k = int(np.argmin(np.append(there, -1) == np.arange(len(there) + 1)))  # the first that is missing
         raise _no_hemisphere(data, f"none at theta_i {theta_i[k // len(theta_r)]:g}, theta_r {theta_r[k % len(theta_r)]:g} deg")
-    pole = np.isin(theta_i[i], (0, 180)) | np.isin(theta_r[r], (0, 180))
-    order = np.argsort(pair, kind="stable")
-    turns = []
-    for at in np.split(order, np.flatnonzero(np.diff(pair[order])) + 1):
-        turns.append(_turn(phi[at], data.values[at]))
-        if not pole[at[0]] and (gap := _widest_gap(turns[-1][0])) > WIDEST_GAP_DEG:
-            where = f"theta_i {data.theta_i_deg[at[0]]:g}, theta_r {data.theta_r_deg[at[0]]:g} deg"
+    pole = np.isin(theta_i, (0, 180))[:, None] | np.isin(theta_r, (0, 180))
+    turns: list[tuple[Array, Array]] = []
+    filled_in = False
+    for k, at in enumerate(_groups(pair)):
+        alone = pole.flat[k]  # any azimuth is the same direction
+        each = [_turn(phi[one], data.values[one]) for one in _lights(data, at)]
+        if not alone and (gap := max(_widest_gap(azimuths) for azimuths, _ in each)) > WIDEST_GAP_DEG:
+            where = f"theta_i {theta_i[k // len(theta_r)]:g}, theta_r {theta_r[k % len(theta_r)]:g} deg"
             raise _no_hemisphere(data, f"at {where} none over {gap:g} deg of azimuth")
-    around = [azimuths for (azimuths, _), k in zip(turns, first, strict=True) if not pole[k]]
-    alike = bool(around) and all(np.array_equal(azimuths, around[0]) for azimuths in around)
-    axis = around[0] if alike else AZIMUTHS
-    table = [np.stack([np.interp(axis, azimuths, one, period=360) for one in values.T], axis=-1) for azimuths, values in turns]
-    lights = np.unique(np.round(data.phi_i_deg[~np.isin(data.theta_i_deg, (0, 180))] % 360, DIGITS)).size
+        filled_in |= not alone and not _alike(each)
+        axis = each[0][0] if _alike(each) else AZIMUTHS
+        turns.append((axis, np.mean([_at(axis, *turn) for turn in each], axis=0)))
+    around = [turn for turn, alone in zip(turns, pole.flat, strict=True) if not alone]
+    axis = around[0][0] if around and _alike(around) else AZIMUTHS
+    filled_in |= not _alike(around)
+    table = [_at(axis, *turn) for turn in turns]
+    lights = np.unique(_azimuths(data.phi_i_deg[~np.isin(data.theta_i_deg, (0, 180))])).size
     return Brdf(
         theta_i,
         None,
@@ -83,8 +87,33 @@ def gridded(data: Scattered) -> Brdf:
         data.quantity,
         data.channels,
         data.source,
-        {**data.metadata, "azimuths": max(lights, 1), "filled_in": bool(around) and not alike},
+        {**data.metadata, "azimuths": max(lights, 1), "filled_in": filled_in},
     )
+
+
+def _azimuths(phi: Array) -> Array:
+    """Within 0 to below 360 deg."""
+    return np.asarray(np.round(phi % 360, DIGITS) % 360)
+
+
+def _groups(keys: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Places of each key, by rising keys."""
+    order = np.argsort(keys, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(keys[order])) + 1)
+
+
+def _lights(data: Scattered, at: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Of these readings, those of each azimuth of the light."""
+    return [at[one] for one in _groups(np.unique(_azimuths(data.phi_i_deg[at]), return_inverse=True)[1])]
+
+
+def _alike(turns: list[tuple[Array, Array]]) -> bool:
+    return all(np.array_equal(azimuths, turns[0][0]) for azimuths, _ in turns)
+
+
+def _at(axis: Array, azimuths: Array, values: Array) -> Array:
+    """Values (p, c) of a turn, straight between its azimuths."""
+    return np.stack([np.interp(axis, azimuths, one, period=360) for one in values.T], axis=-1)
 
 
 def _turn(phi: Array, values: Array) -> tuple[Array, Array]:
@@ -120,31 +149,26 @@ class Whole:
         What may stop short of it. One that is not isotropic is averaged over the light's azimuths.
     beyond : {"refuse", "nearest", "zero"}
         What lies beyond its end: an error, the value at the end, or nothing.
-    channel : str, optional
-        The one to answer with; by default all.
 
     Raises
     ------
     DomainError
-        If `beyond` or the channel is unknown.
+        If `beyond` is unknown.
     """
 
     table: Brdf | Merl | Rgl
     beyond: Beyond = "refuse"
-    channel: str | None = None
 
     def __post_init__(self) -> None:
         if self.beyond not in BEYOND:
             raise DomainError(f"beyond is {self.beyond!r}, expected one of {', '.join(BEYOND)}")
-        if self.channel is not None:
-            object.__setattr__(self, "table", picked(self.table, self.channel))
         if isinstance(self.table, Merl) and self.beyond == "nearest":
             object.__setattr__(self, "table", filled(self.table))
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the values."""
-        return self.table.channels if self.channel is None else (self.channel,)
+        return self.table.channels
 
     @property
     def quantity(self) -> Quantity:
@@ -236,8 +260,7 @@ class Whole:
     def _mean(self, theta_i: Array, theta_r: Array, phi: Array) -> Array:
         """The mean over the light's azimuths."""
         if isinstance(self.table, Merl):
-            found = self.table(theta_i, theta_r, phi)
-            return found if self.channel is None else found[..., [RGB.index(self.channel)]]
+            return self.table(theta_i, theta_r, phi)
         lights = lights_of(self.table)
         if isinstance(self.table, Rgl):
             return sum((self.table.evaluate(theta_i, at, theta_r, at + phi) for at in lights), start=np.zeros(1)) / len(lights)
@@ -245,7 +268,7 @@ class Whole:
 
 
 def picked(data: Any, name: str) -> Any:
-    """Take one channel of a Brdf, Scattered or Rgl; a Merl always has three, and is only checked.
+    """Take one channel of a Brdf, Scattered, Merl or Rgl.
 
     Raises
     ------
@@ -255,8 +278,6 @@ def picked(data: Any, name: str) -> Any:
     if name not in data.channels:
         raise DomainError(f"{data.source}: no channel {name!r}; choose one of {', '.join(data.channels)}")
     at = [data.channels.index(name)]
-    if isinstance(data, Merl):
-        return data
     if isinstance(data, Rgl):
         return replace(data, values=data.values[:, :, at], channels=(name,))
     sigma = {"sigma": data.sigma[..., at]} if isinstance(data, Scattered) and data.sigma is not None else {}

@@ -48,22 +48,20 @@ class Merl:
 
     Attributes
     ----------
-    values : ndarray, shape (90, 90, 180, 3), 1/sr
-        Over the bins of theta_half, theta_diff and phi_diff, and R, G, B; 0 where there is none.
+    values : ndarray, shape (90, 90, 180, c), 1/sr
+        Over the bins of theta_half, theta_diff and phi_diff, and the channels; 0 where there is none.
     valid : ndarray of bool, shape (90, 90, 180)
         Where there is one.
     source : str
         The file.
+    channels : tuple of str
+        R, G and B, or one of them.
     """
 
     values: Array
     valid: NDArray[np.bool_]
     source: str = "MERL"
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of the last axis."""
-        return RGB
+    channels: tuple[str, ...] = RGB
 
     def __call__(self, theta_i_deg: ArrayLike, theta_r_deg: ArrayLike, phi_deg: ArrayLike) -> Array:
         """Look the reflectance up, linearly between the middles of those bins that have a value, or else those next to them.
@@ -79,7 +77,7 @@ class Merl:
 
         Returns
         -------
-        ndarray, of the broadcast shape and 3, 1/sr
+        ndarray, of the broadcast shape and c, 1/sr
 
         Raises
         ------
@@ -97,7 +95,9 @@ class Merl:
 
     def gridded(self, theta_i_deg: ArrayLike, theta_r_deg: ArrayLike, phi_deg: ArrayLike) -> Brdf:
         """Look up all directions of a grid; parameters and errors as for a call."""
-        return Brdf.sampled(self, theta_i_deg, theta_r_deg, phi_deg, channels=RGB, source=self.source, metadata={"format": "MERL"})
+        return Brdf.sampled(
+            self, theta_i_deg, theta_r_deg, phi_deg, channels=self.channels, source=self.source, metadata={"format": "MERL"}
+        )
 
     def _gathered(self, theta_i: ArrayLike, theta_r: ArrayLike, phi: ArrayLike) -> tuple[Array, Array]:
         """Weight of the bins with a value about each direction, and the sum of their weighted values."""
@@ -113,7 +113,8 @@ class Merl:
         places = (np.sqrt(90 * half), diff, np.mod(around, 180.0))
         lower = [np.floor(place - 0.5) for place in places]
         shares = [place - 0.5 - low for place, low in zip(places, lower, strict=True)]
-        total, found = np.zeros(half.shape), np.zeros((3, *half.shape))
+        planes = self.values.shape[-1]
+        total, found = np.zeros(half.shape), np.zeros((planes, *half.shape))
         values, valid = self.values.reshape(-1), self.valid.reshape(-1)  # flat, which is quicker than through their axes
         sides = []
         for low, share, count, round_ in zip(lower, shares, BINS, (False, False, True), strict=True):
@@ -124,8 +125,8 @@ class Merl:
             bins = (j * BINS[1] + k) * BINS[2] + m
             weight = share_j * share_k * share_m * valid[bins]
             total += weight
-            for plane in range(3):
-                found[plane] += weight * values[3 * bins + plane]
+            for plane in range(planes):
+                found[plane] += weight * values[planes * bins + plane]
         return total, np.moveaxis(found, 0, -1)
 
 

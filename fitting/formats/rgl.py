@@ -460,8 +460,9 @@ def _write_tensors(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 def _vector(theta: ArrayLike, phi: ArrayLike) -> Array:
     """Unit vectors, shape (3, ...), from angles in rad."""
-    theta, phi = np.broadcast_arrays(np.asarray(theta, float), np.asarray(phi, float))
-    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    theta, phi = np.asarray(theta, float), np.asarray(phi, float)
+    across = np.sin(theta)
+    return np.stack(np.broadcast_arrays(across * np.cos(phi), across * np.sin(phi), np.cos(theta)))
 
 
 def _neighbours(axis: Array, at: Array) -> list[tuple[NDArray[np.intp], Array]]:
@@ -492,7 +493,7 @@ def _looked_up(pictures: Singles, u: Array, v: Array, slices: list[tuple[Any, An
             for dx, wx in ((0, 1 - x), (1, x)):
                 share, place = weight * wy * wx, (picture * rows + row + dy) * columns + column + dx
                 for c in range(channels):
-                    found[c] += share * planes[place + c * rows * columns]
+                    found[c] += share * planes.take(place + c * rows * columns)
     return found.T
 
 

@@ -39,23 +39,23 @@ def reading(command: Any) -> Any:
 
 @click.group(
     epilog="""\b
+Formats:
+  merl   .binary       MERL: isotropic, R G B, reflection; read and written
+  rgl    .bsdf         RGL tensors, for Mitsuba and pbrt; read and written
+  klems  .xml          Klems matrices, for Radiance and WINDOW; read and written
+  alta   .alta .dat    ALTA text, readings with error bars; read and written
+  pab    .pab .txt     pab text, one file for each incidence; read and written
+  csv    .csv          columns with names; read and written
+  zemax  .zemax.bsdf   Zemax tabular BSDF; written
+
+\b
 Examples:
   rig brdf info petal.bsdf
   rig brdf convert merl/red-fabric.binary red-fabric.bsdf
   rig brdf convert 2026-05-04_RR_1a2b3c4d RR.xml --white 12.5"""
 )
 def command() -> None:
-    r"""Convert files of reflectance, and fits, for other programs.
-
-    \b
-    merl   .binary       MERL: isotropic, R G B, reflection; read and written
-    rgl    .bsdf         RGL tensors, for Mitsuba and pbrt; read and written
-    klems  .xml          Klems matrices, for Radiance and WINDOW; read and written
-    alta   .alta .dat    ALTA text, readings with error bars; read and written
-    pab    .pab .txt     pab text, one file for each incidence; read and written
-    csv    .csv          columns with names; read and written
-    zemax  .zemax.bsdf   Zemax tabular BSDF; written
-    """
+    """Convert files of reflectance, and fits, for other programs."""
 
 
 @command.command(
@@ -201,7 +201,8 @@ def _text(said: dict[str, Any]) -> str:
     names = ", ".join(said["channels"][:8]) + (f" ... ({len(said['channels'])})" if len(said["channels"]) > 8 else "")
     size = ", ".join(f"{count} {what}" for what, count in said["size"].items())
     kind = {"brdf": "reflection", "btdf": "transmission"}[said["quantity"]]
-    lines = [f"{' '.join(said['in'])}: {said['format']}, {said['bytes']} bytes{f', {size}' if size else ''}"]
+    parts = [said["format"], *([f"{said['bytes']} bytes"] if said["bytes"] else []), *([size] if size else [])]
+    lines = [f"{' '.join(said['in'])}: {', '.join(parts)}"]
     lines.append(f"{kind}, channels {names}, {'with' if said['uncertainties'] else 'without'} uncertainties")
     lines += [f"  {name:<10} {a['first']:9.3f} to {a['last']:9.3f} deg, {a['count']:.0f}" for name, a in said["axes"].items()]
     theta_i, theta_r, phi = said["largest_at"]

@@ -9,8 +9,9 @@ import click
 from rig.cli.settings import Settings
 from rig.cultivars import find_cultivar, load_cultivars
 from rig.errors import ConfigError, RunError
-from rig.fitjobs import Job, Specimen, fit_specimen, fit_together, specimen_of_runs
-from rig.fits import StoredFit, provenance_of_file, store_fit
+from rig.fitjobs import Job, Specimen, fit_specimen, fit_together, specimen_of_runs, specimen_of_table
+from rig.fits import StoredFit, store_fit
+from rig.models import kept_traces
 from rig.progress import steps
 from rig.runs import Run, find_run, latest_run
 from rig.tables import comparison_table, fit_table
@@ -75,7 +76,9 @@ Examples:
 )
 @click.option("--white", type=float, metavar="VALUE", help="What a perfect diffuser, lit along its normal, would have read.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the search for a shape.")
-@click.option("--column", "columns", multiple=True, metavar="QUANTITY=NAME", help="FILE: which column holds theta_i, theta_r, value ...")
+@click.option(
+    "--column", "columns", multiple=True, metavar="QUANTITY=NAME", help="FILE: which column holds theta_i, theta_r, phi, value or sigma."
+)
 @click.option("--where", "wheres", multiple=True, metavar="COLUMN=VALUE", help="FILE: use only these rows.")
 @click.option(
     "--theta-i", type=click.FloatRange(0, 90, max_open=True), metavar="DEG", help="FILE: the incidence, where no column holds it."
@@ -105,6 +108,10 @@ Examples:
 @click.option("--channel", metavar="NAME", help="FILE of several channels: which.")
 @click.option("--param-out", metavar="NAME", help="FILE in ALTA's form: what the values are, where it does not say.")
 @click.option("--theta-r-below", type=float, metavar="DEG", help="FILE in ALTA's form: leave out views at this angle and beyond.")
+@click.option(
+    "--most", type=click.IntRange(1), default=500, show_default=True, help="FILE: fit this many readings, drawn evenly; predict the others."
+)
+@click.option("--in-plane", is_flag=True, help="FILE: use only readings in the plane of incidence.")
 @click.option("--page/--no-page", default=True, help="Write the fit's page, with figures, beside it.")
 @click.option("--json", "as_json", is_flag=True, help="For programs.")
 @click.pass_obj
@@ -121,9 +128,9 @@ def command(
     white, knowns = options["white"], _numbers(options["knowns"], "--known")
     if unknown := set(knowns) - set(KNOWN):
         raise ConfigError(f"--known {sorted(unknown)[0]}: expected one of {', '.join(KNOWN)}")
-    for stored, comparison in _fitted(specimens, job, joint):
+    for stored, comparison in _fitted(settings, specimens, job, joint):
         path = store_fit(settings.workspace.fits, stored)
-        solved = _solved(stored, white, knowns) if knowns or white is not None else {}
+        solved = _solved(stored, white, knowns)
         if as_json:
             extra = {} if comparison is None else {"comparison": comparison.to_dict()}
             click.echo(json.dumps(stored.to_dict() | extra | solved))
@@ -157,10 +164,8 @@ def _job(options: dict[str, Any]) -> Job:
     return Job(options["model"], weights, shape, tuple(searched) or None, aperture, options["seed"], options["compared"])
 
 
-def _fitted(specimens: list[Specimen], job: Job, joint: bool) -> "list[tuple[StoredFit, Comparison | None]]":
-    from fitting.ladder import Traces
-
-    traces = Traces()
+def _fitted(settings: Settings, specimens: list[Specimen], job: Job, joint: bool) -> "list[tuple[StoredFit, Comparison | None]]":
+    traces = kept_traces(settings.workspace)
     if joint:
         if job.compared or job.model == "auto":
             raise ConfigError("--joint fits one model that is named: --compare and --model auto are for one cultivar at a time")
@@ -185,19 +190,31 @@ def _specimens(settings: Settings, sources: tuple[str, ...], cultivars: tuple[st
     found += [latest_run(settings.workspace.runs, find_cultivar(known, cultivar).abbreviation) for cultivar in cultivars]
     for run in found:
         runs.setdefault(run.cultivar, []).append(run)
-    read = [Specimen(_label(path), False, provenance_of_file(path), _read(path, options)) for path in tables]
+    read = [specimen_of_table(path, _read(path, options), options["most"], options["seed"]) for path in tables]
     return [specimen_of_runs(some, settings.workspace.runs) for some in runs.values()] + read
 
 
 def _table_options(options: dict[str, Any]) -> list[str]:
     """Name the options given that speak of tables."""
-    usual = {"columns": (), "wheres": (), "theta_i": None, "theta_r_positive": "light", "quantity": "auto", "repeats": "refuse"}
-    usual |= dict.fromkeys(("covariance", "channel", "param_out", "theta_r_below"))
+    usual: dict[str, Any] = {
+        "columns": (),
+        "wheres": (),
+        "theta_i": None,
+        "theta_r_positive": "light",
+        "quantity": "auto",
+        "repeats": "refuse",
+    }
+    usual |= {"most": 500, "in_plane": False} | dict.fromkeys(("covariance", "channel", "param_out", "theta_r_below"))
     names = {"columns": "--column", "wheres": "--where"}
     return [names.get(name, f"--{name.replace('_', '-')}") for name, value in usual.items() if options[name] != value]
 
 
 def _read(path: Path, options: dict[str, Any]) -> "Measurements":
+    m = _table(path, options)
+    return m.take(m.in_plane) if options["in_plane"] else m
+
+
+def _table(path: Path, options: dict[str, Any]) -> "Measurements":
     from fitting.formats.files import format_of
     from fitting.formats.measured import measurements_in
     from fitting.measurements import read_csv
@@ -271,7 +288,3 @@ def _range(option: str, ends: str) -> tuple[float, float]:
         return float(low), float(high)
     except ValueError as exc:
         raise ConfigError(f"--find {option!r}: expected NAME=LOW:HIGH, such as aspect=0.3:2.5") from exc
-
-
-def _label(path: Path) -> str:
-    return "".join(c if c.isalnum() or c == "-" else "-" for c in path.stem) or "table"

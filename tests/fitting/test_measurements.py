@@ -114,8 +114,7 @@ def test_rows_are_chosen_by_number_and_by_text(table: Write) -> None:
         (ROWS + "#" * (1 << 16), 6, f"the line from offset {len(ROWS)} on is longer"),
         ("theta_v," + ROWS, 1, "theta_r may be any of theta_v, theta_r_deg: say which with columns"),
         (ROWS.replace("theta_i_deg", "value"), 1, "value appears twice"),
-        (ROWS.rsplit("45", 1)[0], None, "3 rows, expected at least 4"),
-        (ROWS.splitlines()[0], None, "no rows, expected at least 4"),
+        (ROWS.splitlines()[0], None, "no rows, expected at least 1"),
         ("# nothing\n", None, "no header line"),
         (ROWS.replace("1.25", '"1.25'), 5, "not a comma-separated table"),
     ],
@@ -259,7 +258,7 @@ def test_percent(table: Write, name: str) -> None:
         (FULL.replace("100,2,%", "100,2,1/sr"), 6, "unit is '1/sr', but '%' in line 4"),
         (FULL.replace("deg,%", "deg,").replace("brf [%]", "brf").replace(",%\n", ",\n"), 3, "sigma is in %, but the values are in 1"),
         (FULL.replace(",%\n", ",1/sr\n"), 4, r"brf \[%\] is said to be in % and in 1/sr"),
-        (FULL.replace("phi_i", "psi"), 2, "phi_r is an azimuth without its phi_i"),
+        (FULL.replace("phi_i", "psi"), 2, "phi_r is an azimuth without its phi_i: give that with columns, or phi=0"),
         (FULL.replace("unit", "phi"), 2, "the azimuth may be phi, or that from phi_i to phi_r"),
         (FULL.replace("45,20,90", "45,-20,90").replace("270", "180"), 5, "theta_r is -20, expected 0 or more where phi is not 0"),
         (FULL.replace("-45", "-450"), 7, "phi_r is -450, expected -360"),
@@ -337,8 +336,7 @@ def test_repeats(table: Write) -> None:
     once = read_csv(table(TWICE + "45,40,0,1\n"), repeats="mean")
     assert len(once) == 5
     assert once.sigma is None  # nothing tells the noise of what was read once
-    with pytest.raises(TableError, match="3 rows, expected at least 4"):
-        read_csv(table(TWICE.replace("45,0,0,6\n45,0,90,6\n", "")), repeats="mean")
+    assert len(read_csv(table(TWICE.replace("45,0,0,6\n45,0,90,6\n", "")), repeats="mean")) == 3
 
 
 def test_means_carry_the_uncertainty_of_the_table(table: Write, tmp_path: Path) -> None:

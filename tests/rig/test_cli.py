@@ -129,7 +129,7 @@ BAD = {
     "no such command": (("swep",), 2, "no command 'swep'"),
     "no such option": (("sweep", "--cultivars", "RR"), 2, "No such option"),
     "no such table": (("fit", "nowhere.csv"), 1, "no such file"),
-    "nothing to fit": (("fit",), 2, "name one thing to fit"),
+    "nothing to fit": (("fit",), 2, "name what to fit"),
     "no runs": (("fit", "latest"), 1, "there are no runs"),
     "no complete run": (("fit", "--cultivar", "WR"), 1, "rig sweep --cultivar WR"),
     "figures without fits": (("figures",), 1, "rig fit --cultivar BR"),

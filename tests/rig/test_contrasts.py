@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from fitting.fit import fit
 from fitting.measurements import Measurements
-from fitting.mixture import fit_mixture
 from rig.contrasts import ContrastRow, contrast_table
 from rig.fits import new_fit, refitted
 
@@ -39,8 +39,8 @@ def test_a_fit_is_fitted_again_with_other_cells(weights: str) -> None:
         source="test",
         rows=np.arange(7),
     )
-    stored = new_fit("RR", False, {}, fit_mixture(readings, aspect=0.5, weights=weights))  # type: ignore[arg-type]
-    again, directly = refitted(stored, 1.9).fit, fit_mixture(readings, aspect=1.9, weights=weights)  # type: ignore[arg-type]
+    stored = new_fit("RR", False, {}, fit(readings, shape={"aspect": 0.5}, weights=weights))  # type: ignore[arg-type]
+    again, directly = refitted(stored, 1.9).fit, fit(readings, shape={"aspect": 1.9}, weights=weights)  # type: ignore[arg-type]
     assert again.x == pytest.approx(directly.x)
-    assert (again.aspect, again.weights) == (1.9, weights)
+    assert (again.shape["aspect"], again.weights) == (1.9, weights)
     np.testing.assert_array_equal(again.measured, stored.fit.measured)
