@@ -431,8 +431,12 @@ class BodyTrace:
         back = np.zeros((2 * j, 2 * j))
         back[:j, :j], back[j:, j:] = self.upper.back(options["mu"]), self.lower.back(options["mu_below"])
         source = np.concatenate([down.reshape(-1, j), np.zeros((down.size // j, j))], 1)
-        # Least squares: a clear petal with flat faces holds totally reflected streams for ever, but no light gets into them.
-        arriving = np.linalg.lstsq(np.eye(2 * j) - back @ mesophyll, source.T)[0]
+        remaining = np.eye(2 * j) - back @ mesophyll
+        if max(options["R_m"], options["R_m_below"]) + options["T_m"] + options["D_m"] < 1 - 1e-9:
+            arriving = np.linalg.solve(remaining, source.T)
+        else:
+            # Least squares: a clear petal with flat faces holds totally reflected streams for ever, but no light gets into them.
+            arriving = np.linalg.lstsq(remaining, source.T)[0]
         sent = (mesophyll @ arriving).T.reshape(*down.shape[:-1], 2 * j)
         met = arriving.T.reshape(*down.shape[:-1], 2 * j)
         return _Streams(met[..., :j], met[..., j:], sent[..., :j], sent[..., j:])

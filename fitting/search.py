@@ -198,6 +198,8 @@ class Search:
 
     def tangents(self, found: Mapping[str, float], free: Sequence[str]) -> list[Array]:
         """How each set's fitted values change with some of the numbers searched for, per number: columns, by central differences."""
+        if not free:
+            return [np.empty((len(m), 0)) for m in self.sets]
         middle = self.designs(found)
         x = [self.coefficients(d, m) for d, m in zip(middle, self.sets, strict=True)]
         columns = [np.empty((len(m), len(free))) for m in self.sets]

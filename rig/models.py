@@ -25,6 +25,9 @@ PETAL: Mapping[str, Mapping[str, float]] = {
 }
 """A pale petal to draw where no other is given, for each mode; nobody measured it."""
 
+TRACING = "body cells ladder orders power radiometric surface tracing"
+"""Modules of fitting that what fits trace depends on."""
+
 
 def stored_model(workspace: Workspace, mode: str, cell: "Cell", **settings: Any) -> "Model":
     """Return a model from the workspace, built and kept there where it is not.
@@ -65,16 +68,17 @@ def kept_traces(workspace: Workspace) -> "Traces":
     """Return what fits trace, kept in the workspace for this version of the code."""
     from fitting.ladder import Traces
 
-    return Traces(workspace.models / f"traces-{_digest('traces')}")
+    return Traces(workspace.models / f"traces-{_digest('traces', TRACING)}")
 
 
-def _digest(of: str) -> str:
-    """Name something made by fitting's code as it is now."""
+def _digest(of: str, modules: str = "*") -> str:
+    """Name something made by fitting's code, or some of it, as it is now."""
     import fitting
 
     digest = hashlib.sha256(of.encode())
     for source in sorted(Path(fitting.__file__).parent.glob("*.py")):
-        digest.update(source.read_bytes())
+        if modules == "*" or source.stem in modules.split():
+            digest.update(source.read_bytes())
     return digest.hexdigest()[:12]
 
 
