@@ -273,7 +273,7 @@ class Fit:
         return {
             "model": self.model,
             "x": self.x,
-            **self.shape,
+            **{name: self.shape[name] for name in ("aspect", "n_us", "n_ss") if name in self.shape},
             "shape": self.shape,
             "searched": list(self.searched),
             "shape_sigma": self.shape_sigma,

@@ -326,7 +326,7 @@ def fit_linear(
         Of the columns.
     tangents : array_like, shape (n, q), optional
         How the fitted values change with numbers that were found from the same readings, such as a shape. These may change too, either
-        way: it widens the intervals, takes q degrees of freedom, and changes the coefficients only as far as those numbers were not best.
+        way, in the intervals, which grow wider, and they take q degrees of freedom. The coefficients are those best with the numbers found.
     theta_r_deg : array_like, shape (n,), optional, deg
         Views, for the cosine-weighted error.
     source : str
@@ -359,16 +359,19 @@ def fit_linear(
     weighted, aim = whiten(design[:, present]), whiten(target[:, None])[:, 0]
     length = np.linalg.norm(weighted, axis=0)
     weighted /= length
-    traded = 0
+    traded, best = 0, None
     if tangents is not None:
+        best, pull = _non_negative(weighted, aim, source)
         along = _directions(whiten(_checked_tangents(tangents, len(target), source)))
         weighted, aim, traded = weighted - along @ (along.T @ weighted), aim - along @ (along.T @ aim), along.shape[1]
     u, singular, v = _seen(weighted)
     x, gradient = _non_negative(singular[:, None] * v, u.T @ aim, source)
-    modelled = design[:, present] @ (x / length)
+    if best is None:
+        best, pull = x, gradient
+    modelled = design[:, present] @ (best / length)
     sum_of_squares = float(np.sum((whiten((target - modelled)[:, None])) ** 2))
 
-    dof = max(0, len(target) - int(np.sum(x > 0)) - traded)
+    dof = max(0, len(target) - int(np.sum(best > 0)) - traded)
     scale = math.sqrt(sum_of_squares / dof) if dof > 0 else None
     spread = _spread(u, weights, whiten, noise)
     level = 1.0 if noise is not None else math.inf if scale is None else scale
@@ -387,12 +390,13 @@ def fit_linear(
         free, reach = inverse @ (u.T @ aim), math.sqrt(single) * deviation
         low = np.where(moved, low, np.minimum(low, np.maximum(0.0, free - reach)))
         high = np.where(moved, high, np.maximum(high, free + reach))
+    low, high = np.minimum(low, best), np.maximum(high, best)
 
     def spelt(name: str, i: int) -> Coefficient:
         unseen = bool(moved[i])
-        held = bool(x[i] == 0) and not unseen
-        value, error, lowest, highest = (float(a[i] / length[i]) for a in (x, deviation, low, high))
-        push = 2 * max(0.0, float(slope[i] * length[i])) if held else 0.0
+        held = bool(best[i] == 0) and not unseen
+        value, error, lowest, highest = (float(a[i] / length[i]) for a in (best, deviation, low, high))
+        push = 2 * max(0.0, float(pull[i] * length[i])) if held else 0.0
         return Coefficient(name, value, error, lowest, highest, active=held, multiplier=push, determined=not unseen)
 
     place = np.cumsum(present) - 1

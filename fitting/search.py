@@ -214,6 +214,8 @@ class Search:
 
 def seen(aperture: Aperture, theta_i_deg: Array, theta_r_deg: Array, phi_deg: Array) -> tuple[Directions, Callable[[Array], Array]]:
     """Return the directions of which readings through an aperture are the mean, and the function that takes the mean of terms there."""
+    if aperture.is_ideal:
+        return Directions.of(theta_i_deg, theta_r_deg, phi_deg), lambda terms: terms
     theta_i, theta_r, phi, weight = aperture.nodes(theta_i_deg, theta_r_deg, phi_deg)
     at = Directions.of(theta_i.ravel(), theta_r.ravel(), phi.ravel())
 

@@ -418,6 +418,21 @@ def test_a_searched_shape_widens_the_intervals() -> None:
         assert free.linear[name].low < held.linear[name].low
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_coefficients_are_the_best_for_the_shape_found(seed: int) -> None:
+    """The search's freedom widens intervals, but what is fitted is the fit at that shape, however far from straight the way there is."""
+    view = np.arange(-60.0, 61, 10)[1:]
+    value = np.random.default_rng(seed).uniform(0.05, 0.5, len(view)) + 0.3 * np.exp(-(((view + 45) / 12) ** 2))
+    taken = readings(value, theta_r=view)
+    free = fit(taken, shape={"aspect": (0.1, 4.0), "n_us": (2.0, 200.0), "n_ss": (1.0, 100.0)})
+    held = fit(taken, shape=free.shape)
+    np.testing.assert_allclose(x_of(free), x_of(held), rtol=1e-6)
+    np.testing.assert_allclose(free.modelled, held.modelled, rtol=1e-6)
+    assert free.E_mean == pytest.approx(held.E_mean)
+    for c in free.linear.coefficients:
+        assert c.low <= c.value <= c.high
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_intervals_hold_the_truth_also_where_the_shape_was_found() -> None:
