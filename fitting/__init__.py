@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from fitting.fit import Fit, Prediction, fit_joint
     from fitting.ladder import RUNGS
     from fitting.linear import LinearFit, fit_linear, mixture_from
-    from fitting.measurements import Measurements, read_csv
+    from fitting.measurements import Measurements
     from fitting.model import Model
     from fitting.orders import EscapeOrders, escape_orders
     from fitting.paper import TERMS, Quadrature, paper_terms
     from fitting.radiometric import Sampling, basis_tables, paper_terms_any, radiometric_terms
+    from fitting.readings import read_csv
     from fitting.reflectance import Reflectance
     from fitting.scattering import Scattering
     from fitting.table import Grid, ReflectanceTable, paper_table, radiometric_table
@@ -48,7 +49,7 @@ _HOME = {
     "fit_linear": "linear",
     "mixture_from": "linear",
     "Measurements": "measurements",
-    "read_csv": "measurements",
+    "read_csv": "readings",
     "Model": "model",
     "EscapeOrders": "orders",
     "escape_orders": "orders",

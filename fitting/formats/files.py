@@ -175,7 +175,7 @@ def read_any(path: Path | str | Sequence[Path | str], format: str | None = None,
 
 def _read_csv(path: Path | str) -> Scattered:
     """Read a table with both azimuths, or else one of measurements in 1/sr or reflectance factors."""
-    from fitting.measurements import read_csv
+    from fitting.readings import read_csv
 
     header = next(iter(_cells(path)), [])
     if set(ANGLES) <= set(header) and any(name.startswith(("brdf", "btdf")) for name in header):

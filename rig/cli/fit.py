@@ -217,7 +217,7 @@ def _read(path: Path, options: dict[str, Any]) -> "Measurements":
 def _table(path: Path, options: dict[str, Any]) -> "Measurements":
     from fitting.formats.files import format_of
     from fitting.formats.measured import measurements_in
-    from fitting.measurements import read_csv
+    from fitting.readings import read_csv
 
     if format_of(path) != "csv":
         wanted = {"param_out": options["param_out"], "theta_r_below_deg": options["theta_r_below"]}

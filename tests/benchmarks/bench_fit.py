@@ -18,7 +18,8 @@ from fitting.compare import Comparison, compare
 from fitting.fit import fit, fit_joint
 from fitting.formats.alta import read_alta
 from fitting.ladder import RUNGS, Traces
-from fitting.measurements import Measurements, read_csv
+from fitting.measurements import Measurements
+from fitting.readings import read_csv
 from fitting.search import usual_bounds
 from sim.petals import load, names
 from tests.benchmarks.report import verdict
