@@ -198,7 +198,7 @@ def compare(
 
 def _searches(rung: Rung) -> list[tuple[str, ...]]:
     """What of a rung's shape is searched for: what it says, and for the paper's also all."""
-    all_of_it = tuple(number.name for number in rung.shape)
+    all_of_it = tuple(usual_bounds(rung))
     return [rung.searched] if rung.searched or not all_of_it else [(), all_of_it]
 
 

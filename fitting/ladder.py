@@ -49,12 +49,15 @@ REFRACTION = 1.4
 ORDERS_GRID = np.append(np.arange(0.0, 86.0, 5.0), 88.0), np.arange(0.0, 181.0, 30.0)
 """Nodes of theta and phi between which light of the second and later orders is interpolated: it varies slowly."""
 
-RATIO = {"aspect": 1.4, "n_us": 1.8, "mu": 1.4, "R_m": 1.3}
+RATIO = {"aspect": 1.4, "n_us": 1.8, "mu": 1.4, "R_m": 1.3, "p": 1.4, "q": 1.4}
 """Of neighbouring nodes while a shape is searched for.
 
 What it costs in accuracy, rms over directions and as a fraction of a term's peak, is held by `tests/fitting/test_ladder.py`: diffuse terms
 0.15 %, the lobe of the domes 0.7 %, mirror light of "body" 0.5 %, body light 1.25 %, 2 % where it is darker than a hundredth.
 """
+
+DOME = ("aspect", "p", "q")
+"""Shape numbers that make a cell."""
 
 LEFT = 0.75
 """Of the light that the mesophyll does not reflect this share goes through it, the rest is absorbed [U]."""
@@ -111,6 +114,10 @@ class ShapeNumber:
         Where it is held unless told otherwise.
     most : float
         It lies above 0 and up to this.
+    least : float
+        And is not below this.
+    fine : bool
+        Whether it is searched for only where it is named.
     """
 
     name: str
@@ -120,10 +127,14 @@ class ShapeNumber:
     unit: str
     meaning: str
     most: float = math.inf
+    least: float = 0.0
+    fine: bool = False
 
 
 ASPECT = ShapeNumber("aspect", 0.1, 4.0, 0.5, "1", "height over base diameter of the domes")
 TRACED_ASPECT = replace(ASPECT, high=3.0)  # taller domes take long to trace
+P = ShapeNumber("p", 1.1, 6.0, 2.0, "1", "exponent of the domes' profile z = h (1 - (r/a)^p)^(1/q)", least=1.0, fine=True)
+Q = ShapeNumber("q", 1.1, 6.0, 2.0, "1", "root in the domes' profile", least=1.0, fine=True)
 N_US = ShapeNumber("n_us", 2.0, 200.0, 40.0, "1", "exponent of the epidermis' lobe")
 N_SS = ShapeNumber("n_ss", 1.0, 100.0, 5.0, "1", "exponent of the spongy tissue's lobe")
 ALBEDO = ShapeNumber(
@@ -136,7 +147,7 @@ ALPHA = ShapeNumber("alpha", 0.05, 1.0, 0.3, "1", "roughness of the microfacets"
 
 
 class Traces:
-    """What is slow to trace, kept by aspect while fits are made; `rays` and facets are fewer than for pictures.
+    """What is slow to trace, kept by the domes' shape while fits are made; `rays` and facets are fewer than for pictures.
 
     Parameters
     ----------
@@ -149,27 +160,26 @@ class Traces:
         self.orders = functools.cache(self._orders)
         self.body = functools.cache(self._body)
 
-    def _orders(self, aspect: float) -> EscapeOrders:
+    def _orders(self, cell: Cell) -> EscapeOrders:
         from fitting.orders import EscapeOrders, escape_orders
 
         theta, phi = ORDERS_GRID
-        cell = Cell(aspect)
 
         def trace() -> tuple[dict[str, Any], dict[str, Array]]:
             found = escape_orders(cell, theta, theta, phi, rays=1024)
             return {"decay": found.decay, "closure": found.closure, "unclosed": found.unclosed}, {"bases": found.bases}
 
-        about, arrays = self._kept(f"orders-{aspect:.9g}", trace)
+        about, arrays = self._kept(f"orders-{_spelt(cell)}", trace)
         return EscapeOrders(cell, theta, theta, phi, arrays["bases"], **about, seed=0)
 
-    def _body(self, aspect: float) -> BodyTrace:
+    def _body(self, cell: Cell) -> BodyTrace:
         from fitting.body import BodyTrace, Epidermis, trace_body
 
         def trace() -> tuple[dict[str, Any], dict[str, Array]]:
-            found = trace_body(Epidermis(Cell(aspect)), Epidermis(None), n=REFRACTION, rays=1024)
+            found = trace_body(Epidermis(cell), Epidermis(None), n=REFRACTION, rays=1024)
             return dict(found.provenance), found.arrays()
 
-        about, arrays = self._kept(f"body-{aspect:.9g}", trace)
+        about, arrays = self._kept(f"body-{_spelt(cell)}", trace)
         return BodyTrace.from_arrays(arrays, about)
 
     def _kept(self, name: str, trace: Callable[[], tuple[dict[str, Any], dict[str, Array]]]) -> tuple[dict[str, Any], dict[str, Array]]:
@@ -185,6 +195,15 @@ class Traces:
         with replacing(path) as unfinished:
             archive.write(unfinished, FORMAT, about, arrays)
         return about, arrays
+
+
+def _spelt(cell: Cell) -> str:
+    return "-".join(f"{number:.9g}" for number in (cell.aspect, cell.p, cell.q))
+
+
+def dome(shape: Mapping[str, float]) -> Cell:
+    """Return the cell of a rung's shape numbers."""
+    return Cell(shape["aspect"], shape["p"], shape["q"])
 
 
 class Rung(ABC):
@@ -290,11 +309,11 @@ class _Domed(Rung):
     """Two terms of the domed epidermis, two of the flat spongy tissue."""
 
     terms: ClassVar[tuple[str, ...]] = TERMS
-    shape: ClassVar[tuple[ShapeNumber, ...]] = (ASPECT, N_US, N_SS)
+    shape: ClassVar[tuple[ShapeNumber, ...]] = (ASPECT, P, Q, N_US, N_SS)
     searched: ClassVar[tuple[str, ...]] = ("aspect", "n_us", "n_ss")
 
     @abstractmethod
-    def _domes(self, at: Directions, quick: bool, *, aspect: float, n_us: float) -> Array:
+    def _domes(self, at: Directions, quick: bool, *, n_us: float, **shape: float) -> Array:
         """u_diff and u_spec, shape (n, 2)."""
 
     @abstractmethod
@@ -302,10 +321,10 @@ class _Domed(Rung):
         """s_diff and s_spec, shape (n, 2)."""
 
     def design(self, at: Directions, shape: Mapping[str, float], traces: Traces) -> Array:
-        return np.column_stack([self._domes(at, False, aspect=shape["aspect"], n_us=shape["n_us"]), self._spongy(at, shape["n_ss"])])
+        return np.column_stack([self._domes(at, False, **{name: shape[name] for name in (*DOME, "n_us")}), self._spongy(at, shape["n_ss"])])
 
     def quick_design(self, at: Directions, held: Mapping[str, float], bounds: Mapping[str, tuple[float, float]], traces: Traces) -> Design:
-        domes = _interpolated(functools.partial(self._domes, at, True), ("aspect", "n_us"), held, bounds)
+        domes = _interpolated(functools.partial(self._domes, at, True), (*DOME, "n_us"), held, bounds)
         return lambda found: np.column_stack([domes(found), self._spongy(at, {**held, **found}["n_ss"])])
 
 
@@ -322,12 +341,13 @@ class _Paper(_Domed):
     name, title = "paper", "the paper"
     searched = ()
 
-    def _domes(self, at: Directions, quick: bool, *, aspect: float, n_us: float) -> Array:
+    def _domes(self, at: Directions, quick: bool, *, n_us: float, **shape: float) -> Array:
         from fitting.radiometric import paper_terms_any
 
-        if not at.phi.any():
-            return paper_terms(at.theta_i, at.theta_r, aspect=aspect, n_us=n_us)[:, :2]
-        return paper_terms_any(*at, cell=Cell(aspect), n_us=n_us, sampling=_sampling(quick, n_us))[:, :2]
+        cell = dome(shape)
+        if cell.is_ellipsoid and not at.phi.any():
+            return paper_terms(at.theta_i, at.theta_r, aspect=cell.aspect, n_us=n_us)[:, :2]
+        return paper_terms_any(*at, cell=cell, n_us=n_us, sampling=_sampling(quick, n_us))[:, :2]
 
     def _spongy(self, at: Directions, n_ss: float) -> Array:
         return flat_spongy(at.cos_i, at.mirrored, n_ss)
@@ -336,10 +356,10 @@ class _Paper(_Domed):
 class _Radiometric(_Domed):
     name, title = "radiometric", "radiometric"
 
-    def _domes(self, at: Directions, quick: bool, *, aspect: float, n_us: float) -> Array:
+    def _domes(self, at: Directions, quick: bool, *, n_us: float, **shape: float) -> Array:
         from fitting.radiometric import radiometric_terms
 
-        terms = radiometric_terms(*at, cell=Cell(aspect), n_us=n_us, sampling=_sampling(quick, n_us))
+        terms = radiometric_terms(*at, cell=dome(shape), n_us=n_us, sampling=_sampling(quick, n_us))
         return np.asarray(math.pi * at.cos_i[:, None] * terms[:, :2])
 
     def _spongy(self, at: Directions, n_ss: float) -> Array:
@@ -352,17 +372,17 @@ class _Interreflecting(_Radiometric):
     """The coefficient u_diff is as in "radiometric"; the albedo is of the domes alone and holds for readings of any scale."""
 
     name, title = "interreflecting", "interreflecting"
-    shape = (TRACED_ASPECT, N_US, N_SS, ALBEDO)
+    shape = (TRACED_ASPECT, P, Q, N_US, N_SS, ALBEDO)
     searched = ("aspect", "n_us", "albedo")
 
     def design(self, at: Directions, shape: Mapping[str, float], traces: Traces) -> Array:
         terms = super().design(at, shape, traces)
-        terms[:, 0] += _later(self._orders(at, traces, aspect=shape["aspect"]), shape["albedo"])
+        terms[:, 0] += _later(self._orders(at, traces, **{name: shape[name] for name in DOME}), shape["albedo"])
         return terms
 
     def quick_design(self, at: Directions, held: Mapping[str, float], bounds: Mapping[str, tuple[float, float]], traces: Traces) -> Design:
         first = super().quick_design(at, held, bounds, traces)
-        orders = _interpolated(functools.partial(self._orders, at, traces), ("aspect",), held, bounds)
+        orders = _interpolated(functools.partial(self._orders, at, traces), DOME, held, bounds)
 
         def both(found: Mapping[str, float]) -> Array:
             terms = first(found)
@@ -372,9 +392,9 @@ class _Interreflecting(_Radiometric):
         return both
 
     @staticmethod
-    def _orders(at: Directions, traces: Traces, *, aspect: float) -> Array:
+    def _orders(at: Directions, traces: Traces, **shape: float) -> Array:
         """Light of the second and later orders for albedo 1, an order a row, and in a last row their decay."""
-        orders = traces.orders(aspect)
+        orders = traces.orders(dome(shape))
         later = _between(np.moveaxis(orders.bases[1:], 0, -1), at).T
         return np.vstack([math.pi * at.cos_i * later, np.full(later.shape[1], orders.decay)])
 
@@ -390,11 +410,11 @@ def _later(orders: Array, albedo: float) -> Array:
 class _Body(Rung):
     name, title = "body", "body light"
     terms = ("mirror", "body")
-    shape = (TRACED_ASPECT, MU, R_M)
+    shape = (TRACED_ASPECT, P, Q, MU, R_M)
     searched = ("aspect", "mu")
 
     def design(self, at: Directions, shape: Mapping[str, float], traces: Traces) -> Array:
-        trace, R_m = traces.body(shape["aspect"]), shape["R_m"]
+        trace, R_m = traces.body(dome(shape)), shape["R_m"]
         mirror = trace.mirror_reflectance(*at)
         body = trace.body_reflectance(at.theta_i, at.theta_r, mu=shape["mu"], R_m=R_m, T_m=LEFT * (1 - R_m))
         return np.asarray(math.pi * at.cos_i[:, None] * np.column_stack([mirror, np.broadcast_to(body, mirror.shape)]))

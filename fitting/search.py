@@ -66,9 +66,9 @@ class Shape:
         bounds = {}
         for name, value in given.items():
             ends = value if isinstance(value, tuple) else (value,)
-            most = known[name].most
-            limits = "above 0" + ("" if most == math.inf else f" and at most {most:g}")
-            if not all(math.isfinite(v) and 0 < v <= most for v in ends):
+            least, most = known[name].least, known[name].most
+            limits = (f"{least:g} or more" if least > 0 else "above 0") + ("" if most == math.inf else f" and at most {most:g}")
+            if not all(math.isfinite(v) and v > 0 and least <= v <= most for v in ends):
                 raise DomainError(f"{name} ({known[name].meaning}) must be {limits}, not {value!r}")
             if isinstance(value, tuple):
                 if len(value) != 2 or not value[0] < value[1]:
@@ -81,9 +81,15 @@ class Shape:
 
 
 def usual_bounds(rung: Rung, names: Sequence[str] | None = None) -> dict[str, Range]:
-    """Return bounds to search within: of the numbers named, by default of all; raise DomainError where the rung has no such number."""
+    """Return bounds to search within: of the numbers named, by default of all but the fine ones.
+
+    Raises
+    ------
+    DomainError
+        If the rung has no such number.
+    """
     known: dict[str, Range] = {number.name: (number.low, number.high) for number in rung.shape}
-    chosen = tuple(known) if names is None else tuple(names)
+    chosen = tuple(number.name for number in rung.shape if not number.fine) if names is None else tuple(names)
     Shape.of(rung, dict.fromkeys((n for n in chosen if n not in known), 1.0))
     return {name: known[name] for name in chosen}
 

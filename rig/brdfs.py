@@ -86,10 +86,9 @@ def _interreflecting(fit: "Fit", workspace: Workspace, per_white: float) -> Any:
 
 def _body(fit: "Fit", workspace: Workspace, per_white: float) -> Any:
     """The fit has no light that strays within the domes, and two coefficients where the model has none."""
-    from fitting.cells import Cell
-    from fitting.ladder import LEFT, REFRACTION
+    from fitting.ladder import LEFT, REFRACTION, dome
 
-    model = stored_model(workspace, "body", Cell(fit.shape["aspect"]), n=REFRACTION)
+    model = stored_model(workspace, "body", dome(fit.shape), n=REFRACTION)
     R_m = fit.shape["R_m"]
     table, weights = model.parts(mu=fit.shape["mu"], R_m=R_m, T_m=LEFT * (1 - R_m))
     return _mixed(table, {name: fit.x.get(name, 0.0) for name in weights}, per_white)
@@ -107,9 +106,9 @@ def _mixed(table: "ReflectanceTable", x: Mapping[str, float], per_white: float) 
 
 
 def _model(mode: str, fit: "Fit", workspace: Workspace) -> "Model":
-    from fitting.cells import Cell
+    from fitting.ladder import dome
 
-    return stored_model(workspace, mode, Cell(fit.shape["aspect"]), n_us=fit.shape["n_us"], n_ss=fit.shape["n_ss"])
+    return stored_model(workspace, mode, dome(fit.shape), n_us=fit.shape["n_us"], n_ss=fit.shape["n_ss"])
 
 
 _TABULATED: Mapping[str, Callable[["Fit", Workspace, float], Any]] = {

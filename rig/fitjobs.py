@@ -1,7 +1,7 @@
 """What `rig fit` was asked to do: sources into tables of readings, and settings into fits."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -206,12 +206,13 @@ def _predicted(specimen: Specimen, model: str, shape: Mapping[str, Any], common:
 def shape_for(job: Job) -> "dict[str, Range]":
     """Shape numbers of the job's model: held as told, searched for as told or as the ladder's comparison does."""
     from fitting.ladder import rung_of
+    from fitting.search import usual_bounds
 
     rung = rung_of(job.model)
     names = rung.searched if job.searched is None else job.searched
     if "all" in names:
-        names = tuple(number.name for number in rung.shape)
-    return search_bounds(job.model, [name for name in names if name != "none"]) | held(job, job.model, strict=True)
+        names = (*usual_bounds(rung), *(name for name in names if name != "all"))
+    return search_bounds(job.model, dict.fromkeys(name for name in names if name != "none")) | held(job, job.model, strict=True)
 
 
 def held(job: Job, model: str, *, strict: bool = False) -> "dict[str, Range]":
@@ -222,12 +223,12 @@ def held(job: Job, model: str, *, strict: bool = False) -> "dict[str, Range]":
     return {name: value for name, value in job.shape.items() if strict or name in known}
 
 
-def search_bounds(model: str, names: Sequence[str]) -> "dict[str, Range]":
+def search_bounds(model: str, names: Iterable[str]) -> "dict[str, Range]":
     """Return the usual bounds of shape numbers."""
     from fitting.ladder import rung_of
     from fitting.search import usual_bounds
 
-    return usual_bounds(rung_of(model), names)
+    return usual_bounds(rung_of(model), tuple(names))
 
 
 def _effort(job: Job) -> Any:

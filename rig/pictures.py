@@ -70,11 +70,11 @@ def marked(image: Any, marks: Sequence[str]) -> Any:
 
 def shade_of(fit: StoredFit, workspace: Workspace) -> "Reflectance":
     """Return the fitted intensity for any direction; the paper's model is kept in the workspace, the others are tabulated anew."""
-    from fitting.cells import Cell
+    from fitting.ladder import dome
 
     shape = fit.fit.shape
     if fit.fit.model == "paper":
-        model = stored_model(workspace, "paper", Cell(shape["aspect"]), n_us=shape["n_us"], n_ss=shape["n_ss"])
+        model = stored_model(workspace, "paper", dome(shape), n_us=shape["n_us"], n_ss=shape["n_ss"])
         return model.reflectance(**fit.fit.x)
     return fit.fit.tabulated()
 

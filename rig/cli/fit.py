@@ -52,7 +52,7 @@ Examples:
     "finds",
     multiple=True,
     metavar="NAME[=LOW:HIGH]",
-    help="Search for a shape number: aspect, n_us, n_ss, albedo, mu, R_m, n, alpha; all of them: all; none: none.",
+    help="Search for a shape number: aspect, n_us, n_ss, albedo, mu, R_m, n, alpha; all of these: all; none: none. Profile: p, q.",
 )
 @click.option("--hold", "holds", multiple=True, metavar="NAME=VALUE", help="Hold a shape number.")
 @click.option("--aspect", type=click.FloatRange(0.01, 10), help="Hold the height over width of the domes [usual: 0.5, hemispheres].")

@@ -104,7 +104,7 @@ def test_the_paper_stands_beside_with_its_usual_shape_and_with_its_shape_found()
     assert usual.fit is not None
     assert best.fit is not None
     assert usual.searched == ()
-    assert usual.fit.shape == {"aspect": 0.5, "n_us": 40, "n_ss": 5}
+    assert usual.fit.shape == {"aspect": 0.5, "p": 2, "q": 2, "n_us": 40, "n_ss": 5}
     assert usual.parameters == 4
     assert best.searched == ("aspect", "n_us", "n_ss")
     assert best.parameters == 7

@@ -54,7 +54,7 @@ def test_what_was_mixed_is_found(x: tuple[float, ...], aspect: float) -> None:
     assert found.linear.active == ()
     assert found.determined
     assert "15 readings fix 4 of 4 coefficients" in found.statement
-    assert found.shape == {"aspect": aspect, "n_us": 40, "n_ss": 5}
+    assert found.shape == {"aspect": aspect, "p": 2, "q": 2, "n_us": 40, "n_ss": 5}
     assert found.searched == ()
     assert found.search is None
 

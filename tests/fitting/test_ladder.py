@@ -21,6 +21,7 @@ from fitting.search import usual_bounds
 from fitting.table import Grid
 
 VIEWS = np.arange(-70.0, 71, 10)
+ROUND_DOME = {"p": 2.0, "q": 2.0}
 ROUND = Directions.of(np.repeat([20.0, 60.0], 6), [15, 15, 40, 40, 65, 65] * 2, [0, 90, 30, 180, 60, 150] * 2)
 """In the plane and out of it, on both sides."""
 
@@ -197,7 +198,7 @@ def test_fresnel_by_snells_law(theta: float, n: float) -> None:
 @pytest.mark.parametrize("aspect", [0.5, 1.9])
 def test_the_papers_rung_is_eq_7_in_the_plane_and_out_of_it(aspect: float, traces: Traces) -> None:
     """One reading out of the plane takes all to the other quadrature: nothing may jump, by 0.5 % of a term's peak."""
-    shape = {"aspect": aspect, "n_us": 40.0, "n_ss": 5.0}
+    shape = {"aspect": aspect, **ROUND_DOME, "n_us": 40.0, "n_ss": 5.0}
     inside = Directions.of(45.0, VIEWS)
     both = Directions.of(45.0, np.append(VIEWS, 30.0), np.append(np.zeros(15), 60.0))
     exact = RUNGS["paper"].design(inside, shape, traces)
@@ -210,7 +211,7 @@ def test_the_papers_rung_is_eq_7_in_the_plane_and_out_of_it(aspect: float, trace
 def test_radiometric_is_what_the_tables_hold(aspect: float, traces: Traces) -> None:
     """In 1/sr times pi cos(theta_i), as a model for pictures has it at its nodes; fewer facets here, so 1 % of a term's peak."""
     model = build("radiometric", Cell(aspect), n_us=12.0, grid=Grid(12, 12))
-    shape = {"aspect": aspect, "n_us": 12.0, "n_ss": 5.0}
+    shape = {"aspect": aspect, **ROUND_DOME, "n_us": 12.0, "n_ss": 5.0}
     at = Directions.of(*np.broadcast_arrays([[15.0], [60.0]], [15.0, 45, 60, 30], [0.0, 90, 120, 180]))
     ours = RUNGS["radiometric"].design(at, shape, traces) / (math.pi * at.cos_i[:, None])
     i, r, p = (np.searchsorted(nodes, column) for nodes, column in zip(model.table.nodes, at, strict=True))
@@ -228,7 +229,7 @@ def test_the_spongy_terms_are_reciprocal_out_of_the_plane(theta_i: float, theta_
 
 
 def test_the_domes_are_reciprocal(traces: Traces) -> None:
-    shape = {"aspect": 1.2, "n_us": 40.0, "n_ss": 5.0}
+    shape = {"aspect": 1.2, **ROUND_DOME, "n_us": 40.0, "n_ss": 5.0}
     swapped = Directions(ROUND.theta_r, ROUND.theta_i, ROUND.phi)
     one = RUNGS["radiometric"].design(ROUND, shape, traces) / ROUND.cos_i[:, None]
     other = RUNGS["radiometric"].design(swapped, shape, traces) / swapped.cos_i[:, None]
@@ -287,7 +288,7 @@ def test_body_light_is_the_models_without_strays(traces: Traces) -> None:
     table, weights = model.parts(mu=mu, R_m=R_m, T_m=T_m)
     assert set(weights.values()) == {1.0}
     at = Directions.of(*np.broadcast_arrays([[15.0], [60.0]], [15.0, 45, 60, 30], [0.0, 90, 120, 180]))
-    ours = rung.design(at, {"aspect": 0.5, "mu": mu, "R_m": R_m}, traces) / (math.pi * at.cos_i[:, None])
+    ours = rung.design(at, {"aspect": 0.5, **ROUND_DOME, "mu": mu, "R_m": R_m}, traces) / (math.pi * at.cos_i[:, None])
     i, r, p = (np.searchsorted(nodes, column) for nodes, column in zip(table.nodes, at, strict=True))
     for column, name in zip(ours.T, ("mirror", "body"), strict=True):
         theirs = table.values[table.names.index(name)][i, r, p]
@@ -296,10 +297,10 @@ def test_body_light_is_the_models_without_strays(traces: Traces) -> None:
 
 def test_more_pigment_leaves_less_body_light_and_the_mirror_alone(traces: Traces) -> None:
     rung = RUNGS["body"]
-    faint, strong = (rung.design(ROUND, {"aspect": 0.5, "mu": mu, "R_m": 0.6}, traces) for mu in (0.01, 1.0))
+    faint, strong = (rung.design(ROUND, {"aspect": 0.5, **ROUND_DOME, "mu": mu, "R_m": 0.6}, traces) for mu in (0.01, 1.0))
     np.testing.assert_array_equal(faint[:, 0], strong[:, 0])
     assert np.all(strong[:, 1] < 0.1 * faint[:, 1])
-    rich, poor = (rung.design(ROUND, {"aspect": 0.5, "mu": 0.01, "R_m": R_m}, traces) for R_m in (0.9, 0.3))
+    rich, poor = (rung.design(ROUND, {"aspect": 0.5, **ROUND_DOME, "mu": 0.01, "R_m": R_m}, traces) for R_m in (0.9, 0.3))
     assert np.all(poor[:, 1] < 0.5 * rich[:, 1])
 
 
@@ -308,9 +309,9 @@ def test_more_pigment_leaves_less_body_light_and_the_mirror_alone(traces: Traces
 
 def test_unit_reflectances(traces: Traces) -> None:
     n_ss = 7.0
-    paper = unit_reflectances(RUNGS["paper"], {"aspect": 0.5, "n_us": 40.0, "n_ss": n_ss}, traces)
+    paper = unit_reflectances(RUNGS["paper"], {"aspect": 0.5, **ROUND_DOME, "n_us": 40.0, "n_ss": n_ss}, traces)
     np.testing.assert_allclose(paper[2:], [1, 2 / (n_ss + 2)], rtol=1e-9)
-    per_sr = unit_reflectances(RUNGS["radiometric"], {"aspect": 0.5, "n_us": 40.0, "n_ss": n_ss}, traces)
+    per_sr = unit_reflectances(RUNGS["radiometric"], {"aspect": 0.5, **ROUND_DOME, "n_us": 40.0, "n_ss": n_ss}, traces)
     np.testing.assert_allclose(per_sr[2:], [1, 1], rtol=1e-9)
     assert 0 < per_sr[0] < 1  # what one bounce of white domes sends back
     smooth = unit_reflectances(RUNGS["ggx"], {"alpha": 0.05}, traces)

@@ -190,7 +190,7 @@ def test_what_cannot_be_searched() -> None:
 
 def test_shapes_are_held_at_what_is_given_and_else_at_the_usual() -> None:
     shape = Shape.of(PAPER, {"aspect": (0.5, 2.0), "n_us": 20})
-    assert shape.held == {"n_us": 20.0, "n_ss": 5.0}
+    assert shape.held == {"p": 2.0, "q": 2.0, "n_us": 20.0, "n_ss": 5.0}
     assert shape.bounds == {"aspect": (0.5, 2.0)}
     assert usual_bounds(PAPER, ["n_us"]) == {"n_us": (2.0, 200.0)}
     assert set(ALL) == {"aspect", "n_us", "n_ss"}
@@ -213,12 +213,13 @@ def test_tangents_are_derivatives_of_the_fitted_values() -> None:
     readings = made(X, (15.0, 60.0), noise=0.01)
     search = Search.of(PAPER, Shape.of(PAPER, {"aspect": (0.5, 3.0), "n_ss": (1.0, 100.0)}), [readings], "relative", None, None)
     at = {"aspect": 1.1, "n_ss": 6.0}
+    whole = {"p": 2.0, "q": 2.0} | TRUTH | at
     (columns,) = search.tangents(at, ["aspect", "n_ss"])
     x = search.coefficients(search.designs(at)[0], readings)
     step = 1e-4
     for column, name in zip(columns.T, at, strict=True):
         ends = [
-            PAPER.design(Directions.of(readings.theta_i_deg, readings.theta_r_deg), TRUTH | at | {name: at[name] + s}, Traces()) @ x
+            PAPER.design(Directions.of(readings.theta_i_deg, readings.theta_r_deg), whole | {name: at[name] + s}, Traces()) @ x
             for s in (-step, step)
         ]
         np.testing.assert_allclose(column, (ends[1] - ends[0]) / (2 * step), atol=0.08 * np.abs(column).max())
@@ -237,3 +238,22 @@ def test_the_aperture_is_in_the_search() -> None:
     knowing, naive = (fit(readings, "phong", shape={"n": (1.0, 500.0)}, aperture=a) for a in (aperture, None))
     assert knowing.shape["n"] == pytest.approx(sharp, rel=1e-4)
     assert naive.shape["n"] < 0.85 * sharp
+
+
+@pytest.mark.slow
+def test_the_domes_profile_is_found_where_it_is_asked_for() -> None:
+    """Readings of blunt domes by the exact terms; the ladder itself leaves the profile alone."""
+    rung = RUNGS["radiometric"]
+    theta_i, theta_r = (a.ravel() for a in np.meshgrid([20.0, 45.0, 65.0], np.arange(-70.0, 71, 10), indexing="ij"))
+    truth = {"aspect": 1.0, "p": 3.5, "q": 2.0, "n_us": 20.0, "n_ss": 5.0}
+    value = rung.design(Directions.of(theta_i, theta_r), truth, Traces()) @ [0.4, 0.3, 0.1, 0.05]
+    readings = Measurements(theta_i, theta_r, value)
+    held = {name: truth[name] for name in ("aspect", "q", "n_us", "n_ss")}
+    found = fit(readings, "radiometric", shape={**held, "p": (1.1, 6.0)}, effort=Effort(global_evaluations=30))
+    assert found.converged
+    assert found.shape["p"] == pytest.approx(3.5, rel=0.02)
+    assert found.E_mean < 0.3 < fit(readings, "radiometric", shape=held).E_mean
+    assert not {"p", "q"} & set(usual_bounds(rung))
+    assert usual_bounds(rung, ["p"]) == {"p": (1.1, 6.0)}
+    with pytest.raises(DomainError, match=r"p .* must be 1 or more"):
+        fit(readings, "radiometric", shape={"p": 0.5})

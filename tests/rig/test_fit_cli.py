@@ -53,7 +53,7 @@ def test_the_coefficients_of_a_table_come_back_with_what_can_be_said_of_them(rig
     (fitted,) = rig("petal.csv", "--aspect", "1.2")
     assert fitted["x"] == pytest.approx(X, rel=1e-4)
     assert fitted["model"] == "paper"
-    assert fitted["shape"] == {"aspect": 1.2, "n_us": 40.0, "n_ss": 5.0}
+    assert fitted["shape"] == {"aspect": 1.2, "p": 2.0, "q": 2.0, "n_us": 40.0, "n_ss": 5.0}
     assert fitted["reflectances"]["s_diff"][0] == pytest.approx(X["s_diff"], rel=1e-4)
     assert fitted["reflectances"]["s_spec"][0] == pytest.approx(X["s_spec"] * 2 / 7, rel=1e-3)
     assert fitted["linear"]["coefficients"][0]["determined"]
@@ -153,7 +153,7 @@ def test_files_of_others_are_fitted_as_they_are(rig: RigFit) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (("petal.csv", "--find", "mu"), 1, "has no mu: its shape numbers are aspect, n_us, n_ss"),
+        (("petal.csv", "--find", "mu"), 1, "has no mu: its shape numbers are aspect, p, q, n_us, n_ss"),
         (("petal.csv", "--hold", "aspect"), 2, "expected NAME=VALUE"),
         (("petal.csv", "--hold", "aspect=tall"), 2, "expected NAME=NUMBER"),
         (("petal.csv", "--find", "aspect=1"), 2, "expected NAME=LOW:HIGH"),
