@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import struct
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,16 +63,6 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, .
     """One reflectance in every format."""
     folder = tmp_path_factory.mktemp("sources")
     return {kind: write_any(folder / name, grey).paths for kind, name in NAMES.items()}
-
-
-@pytest.fixture
-def mitsuba() -> Iterator[Any]:
-    mi = pytest.importorskip("mitsuba", reason="Mitsuba 3 is an optional extra")
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield mi
-    if before:
-        mi.set_variant(before)
 
 
 @pytest.mark.slow

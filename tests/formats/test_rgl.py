@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import struct
-from collections.abc import Iterator
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -26,17 +25,6 @@ SETTINGS = settings(deadline=None, max_examples=150, suppress_health_check=[Heal
 
 def grey(theta_i: Any, theta_r: Any, phi: Any) -> Any:
     return lobes(theta_i, theta_r, phi)[..., 1]
-
-
-@pytest.fixture
-def mitsuba() -> Iterator[Any]:
-    """Mitsuba 3, its variant put back afterwards."""
-    mi = pytest.importorskip("mitsuba", reason="Mitsuba 3 is an optional extra")
-    before = mi.variant()
-    mi.set_variant("scalar_rgb")
-    yield mi
-    if before:
-        mi.set_variant(before)
 
 
 def unit(theta: float, phi: float) -> list[float]:
