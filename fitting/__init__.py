@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from fitting.errors import DomainError, EnergyError, FitError, ReadingError, TableError
     from fitting.fit import Fit, Prediction, fit_joint
     from fitting.ladder import RUNGS
-    from fitting.linear import LinearFit, fit_linear, mixture_from
+    from fitting.layers import mixture_from
+    from fitting.linear import LinearFit, fit_linear
     from fitting.measurements import Measurements
     from fitting.model import Model
     from fitting.orders import EscapeOrders, escape_orders
@@ -47,7 +48,7 @@ _HOME = {
     "RUNGS": "ladder",
     "LinearFit": "linear",
     "fit_linear": "linear",
-    "mixture_from": "linear",
+    "mixture_from": "layers",
     "Measurements": "measurements",
     "read_csv": "readings",
     "Model": "model",

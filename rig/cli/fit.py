@@ -239,7 +239,7 @@ def _solved(stored: StoredFit, white: float | None, knowns: dict[str, float]) ->
     if white is not None or fit.quantity != "intensity":
         out["reflectances"] = {name: list(values) for name, values in fit.reflectances(white).items()}
     if knowns:
-        from fitting.linear import mixture_from
+        from fitting.layers import mixture_from
 
         out["layers"] = {name: list(ends) for name, ends in mixture_from(fit.x, **knowns).items()}
     return out

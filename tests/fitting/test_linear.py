@@ -14,7 +14,8 @@ from scipy.optimize import lsq_linear, nnls
 from scipy.stats import chi2, f, norm, t
 
 from fitting import TERMS, FitError, ReadingError, paper_terms
-from fitting.linear import LinearFit, fit_linear, mixture_from
+from fitting.layers import mixture_from
+from fitting.linear import LinearFit, fit_linear
 
 VIEWS = np.arange(-70.0, 71, 10)
 POINT = norm.ppf(0.975) ** 2
