@@ -436,7 +436,7 @@ def test_coefficients_are_the_best_for_the_shape_found(seed: int) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_intervals_hold_the_truth_also_where_the_shape_was_found() -> None:
-    """1000 sets of readings, the aspect found anew from each: truth inside the 95 % interval 92 to 98 times in 100.
+    """300 sets of readings, the aspect found anew from each: truth inside the 95 % interval 91 to 99 times in 100, 3 sd of drawing.
 
     The truth is made at an aspect between nodes; the readings are of two incidences, so that aspect and mixture part company.
     """
@@ -448,7 +448,7 @@ def test_intervals_hold_the_truth_also_where_the_shape_was_found() -> None:
     clean = paper_terms(theta_i, theta_r, aspect=aspect) @ x
     random, effort = np.random.default_rng(11), Effort(global_evaluations=0, starts=1)
     inside, errors, found_aspect = np.zeros(4), np.zeros(4), 0
-    rung, times = RUNGS["paper"], 1000
+    rung, times = RUNGS["paper"], 300
     quick = None
     for _ in range(times):
         noise = 0.01 * clean
@@ -464,5 +464,5 @@ def test_intervals_hold_the_truth_also_where_the_shape_was_found() -> None:
         found_aspect += abs(one.shape["aspect"] - aspect) < 1.96 * sigma
     assert np.all(x > 3 * errors / times), x / (errors / times)
     share = 100 * inside / times
-    assert np.all((share >= 92) & (share <= 98)), dict(zip(TERMS, share, strict=True))
-    assert 92 <= 100 * found_aspect / times <= 98
+    assert np.all((share >= 91) & (share <= 99)), dict(zip(TERMS, share, strict=True))
+    assert 91 <= 100 * found_aspect / times <= 99

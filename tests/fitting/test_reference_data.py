@@ -100,11 +100,11 @@ def test_no_rung_sends_light_back_as_the_tape_does() -> None:
     assert len(taken) == 255
     peak = int(np.argmax(taken.intensity))
     assert taken.theta_r_deg[peak] == pytest.approx(taken.theta_i_deg[peak])
-    for row in compare(taken, models=("lambert", "phong", "ggx", "paper")).rows:
-        assert row.fit is not None
-        assert row.fit.modelled[peak] < 0.01 * row.fit.measured[peak]
-        assert row.E_mean is not None
-        assert row.E_mean > 10
+    rows = compare(taken, models=("lambert", "phong", "ggx")).rows
+    for found in (*(row.fit for row in rows), fit(taken)):
+        assert found is not None
+        assert found.modelled[peak] < 0.01 * found.measured[peak]
+        assert found.E_mean > 10
 
 
 def test_the_diffuser_is_mostly_spongy_tissue() -> None:

@@ -80,14 +80,14 @@ def test_a_sweep_from_the_bench_to_a_stored_fit(rig, tmp_path: Path) -> None:
     assert fitted["simulated"] is True
     shown = json.loads(rig("runs", "show", "latest", "--json").stdout)
     assert {key: shown[key] for key in ("x", "E", "E_mean", "E_max")} == {key: fitted[key] for key in ("x", "E", "E_mean", "E_max")}
-    assert "SIMULATED" in rig("fit", "--cultivar", "RR", "--weights", "plain", "--aspect", "1.9").stdout
+    assert "SIMULATED" in rig("fit", "--cultivar", "RR", "--weights", "plain", "--aspect", "1.9", "--no-page").stdout
 
     # One bad point, measured again into the same run.
     rig("sweep", "--redo", "latest", "--theta-r", "20")
     shown = json.loads(rig("runs", "show", "latest", "--json").stdout)
     assert [r["superseded"] for r in shown["readings"]] == [r["theta_r_setpoint"] == 20 for r in shown["readings"][:7]] + [False]
     assert shown["state"] == "complete"
-    refitted = json.loads(rig("fit", "latest", "--json").stdout)
+    refitted = json.loads(rig("fit", "latest", "--no-page", "--json").stdout)
     assert refitted["measured"] != fitted["measured"]
     assert len(refitted["measured"]) == 7
     assert refitted["provenance"]["journal_sha256"] != fitted["provenance"]["journal_sha256"]
@@ -102,7 +102,7 @@ def test_a_sweep_from_the_bench_to_a_stored_fit(rig, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_repeats_give_a_sigma_to_weight_by(rig, tmp_path: Path) -> None:
     rig(*SWEEP, "--repeat", "3", "--out", "here")
-    fitted = json.loads(rig("fit", "here", "--weights", "sigma", "--json").stdout)
+    fitted = json.loads(rig("fit", "here", "--weights", "sigma", "--no-page", "--json").stdout)
     assert len(fitted["measured"]) == 7
     assert (tmp_path / "here" / "journal.jsonl").exists()
     assert "is there already" in rig(*SWEEP, "--out", "here", check=2).stderr
@@ -228,6 +228,7 @@ def test_a_table_of_others_is_fitted(rig, tmp_path: Path) -> None:
         "lamp=on",
         "--quantity",
         "intensity",
+        "--no-page",
     )
     fitted = json.loads(rig(*arguments, "--json").stdout)
     assert len(fitted["E"]) == 7
@@ -235,7 +236,7 @@ def test_a_table_of_others_is_fitted(rig, tmp_path: Path) -> None:
     assert fitted["simulated"] is False
     without_incidence = ("fit", "t.csv", "--column", "theta_r=angle", "--column", "value=counts", "--where", "lamp=on")
     assert "theta_i" in rig(*without_incidence, check=1).stderr
-    assert json.loads(rig(*without_incidence, "--theta-i", "45", "--json").stdout)["E"] == fitted["E"]
+    assert json.loads(rig(*without_incidence, "--theta-i", "45", "--no-page", "--json").stdout)["E"] == fitted["E"]
     (tmp_path / "t3.csv").write_text("theta_i,theta_r,value\n45,0,1\n45,10,nan\n45,20,1\n45,30,1\n45,40,1\n")
     assert re.search(r"t3\.csv.*(line|row|:) ?3", rig("fit", "t3.csv", check=1).stderr)
 
@@ -244,7 +245,18 @@ def test_a_table_of_others_is_fitted(rig, tmp_path: Path) -> None:
 def test_the_leaf_table(rig, shared_data: Path) -> None:
     table = str(shared_data / "leaf" / "principal_plane_dj.csv")
     fitted = json.loads(
-        rig("fit", table, "--theta-r-positive", "forward", "--where", "theta_i_deg=40", "--where", "wavelength_nm=550", "--json").stdout
+        rig(
+            "fit",
+            table,
+            "--theta-r-positive",
+            "forward",
+            "--where",
+            "theta_i_deg=40",
+            "--where",
+            "wavelength_nm=550",
+            "--no-page",
+            "--json",
+        ).stdout
     )
     assert fitted["E_mean"] > 0
     assert len(fitted["E"]) >= 10
