@@ -13,7 +13,7 @@ from rig.runs import Run, list_runs
 if TYPE_CHECKING:
     from fitting.aperture import Aperture
     from fitting.compare import Comparison
-    from fitting.fit import Prediction
+    from fitting.fit import Fit, Prediction
     from fitting.ladder import Traces
     from fitting.linear import Weights
     from fitting.measurements import Measurements
@@ -166,7 +166,7 @@ def fit_specimen(specimen: Specimen, job: Job, traces: "Traces", progress: "Prog
     else:
         shape = shape_for(job)
         found = fit(m, job.model, shape=shape, **common)
-    predicted = _predicted(specimen, found.model, shape, common)
+    predicted = _predicted(specimen, found, shape, common)
     return new_fit(specimen.label, specimen.simulated, specimen.provenance, replace(found, predicted=predicted)), comparison
 
 
@@ -186,21 +186,23 @@ def fit_together(specimens: Sequence[Specimen], job: Job, traces: "Traces") -> l
     return [new_fit(s.label, s.simulated, s.provenance, fit) for s, fit in zip(specimens, fits, strict=True)]
 
 
-def _predicted(specimen: Specimen, model: str, shape: Mapping[str, Any], common: Mapping[str, Any]) -> "tuple[Prediction, ...]":
-    """What the readings at 45 deg foretell of the specimen's others."""
+def _predicted(specimen: Specimen, found: "Fit", shape: Mapping[str, Any], common: Mapping[str, Any]) -> "tuple[Prediction, ...]":
+    """What the readings at 45 deg foretell of the specimen's others, and the fit of what was not in it."""
     from fitting.errors import FitError
-    from fitting.fit import fit, predicted, predictions
+    from fitting.fit import predicted, predictions
 
-    m = specimen.measurements
     try:
-        inside = predictions(m, model, shape=shape, **common)
-        if not specimen.others:
-            return inside
-        alone = fit(m, model, shape=shape, **common)
-        return (*inside, *(predicted(alone, other, what) for what, other in specimen.others))
+        inside = predictions(specimen.measurements, found.model, shape=shape, **common)
     except FitError as exc:  # the fit to all readings stands
         print(f"rig: nothing is predicted from 45 deg: {exc}", file=sys.stderr)
-        return ()
+        inside = ()
+    outside = []
+    for what, other in specimen.others:
+        try:
+            outside.append(predicted(found, other, what))
+        except FitError as exc:
+            print(f"rig: {what} cannot be predicted: {exc}", file=sys.stderr)
+    return (*inside, *outside)
 
 
 def shape_for(job: Job) -> "dict[str, Range]":
