@@ -428,7 +428,7 @@ def _descend(function: _Counted, u: Array, iterations: int) -> tuple[Array, str]
         if function.raised is not None:
             raise
         return u, f"the descent failed: {error}"  # judged where it began
-    why = {0: "out of evaluations", 1: "no slope left", 2: "the cost falls no more", 3: "the step vanished", 4: "cost and step vanished"}
+    why = {0: "no evaluations left", 1: "no slope left", 2: "the cost falls no more", 3: "the step vanished", 4: "cost and step vanished"}
     return found.x, why[found.status]
 
 

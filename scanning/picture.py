@@ -45,10 +45,9 @@ def draw_petal(path: str | Path, mesh: TriangleMesh, petal: Petal, *, name: str,
     front.set_title("inner face, depth")
     slope.set_title("steepness")
     for point, mark, label in ((petal.base, "o", "base"), (petal.tip, "^", "tip"), (petal.inflection, "x", "inflection")):
-        front.plot(*point[:2], mark, color="red", label=label)
+        front.plot(*point[:2], mark, color="red")
         local = (point - petal.T_scan_petal[:3, 3]) @ petal.T_scan_petal[:3, :3]
         side.plot(*local[1:], mark, color="red", label=label)
-    front.legend(loc="upper right", fontsize="small")
     measured = (petal.midrib - petal.T_scan_petal[:3, 3]) @ petal.T_scan_petal[:3, :3]
     side.plot(measured[:, 1], measured[:, 2], ".", color="grey", markersize=2, label="midrib")
     side.plot(*petal.profile.T, color="black", linewidth=1, label="smooth")

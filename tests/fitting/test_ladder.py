@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -397,3 +398,20 @@ def test_fewer_facets_are_what_the_search_uses(traces: Traces) -> None:
     many = radiometric_terms(*PLACES, cell=Cell(0.5), n_us=n_us)
     error = np.abs(few - many).max(0) / many.max(0)
     assert np.all(error[:2] < 0.01)
+
+
+@pytest.mark.slow
+def test_traces_are_kept_in_a_folder_and_made_anew_where_damaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fitting import body
+
+    flat = Cell(0.15)
+    made = Traces(tmp_path / "traces").body(flat)
+    made.body_reflectance(30, 20, mu=0.1, R_m=0.5, T_m=0.3)
+    (path,) = (tmp_path / "traces").iterdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(body, "trace_body", lambda *_, **__: pytest.fail("traced again"))
+        kept = Traces(tmp_path / "traces").body(flat)
+    assert kept.body_reflectance(30, 20, mu=0.1, R_m=0.5, T_m=0.3) == made.body_reflectance(30, 20, mu=0.1, R_m=0.5, T_m=0.3)
+    path.write_bytes(path.read_bytes()[:-100])
+    again = Traces(tmp_path / "traces").body(flat)
+    assert again.body_reflectance(30, 20, mu=0.1, R_m=0.5, T_m=0.3) == made.body_reflectance(30, 20, mu=0.1, R_m=0.5, T_m=0.3)

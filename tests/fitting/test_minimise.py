@@ -173,7 +173,7 @@ def test_a_descent_cut_short_is_not_called_converged(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("fitting.minimise.POLISH", 0)
     found = minimise(decay, [(0.1, 9), (0.1, 9), (0, 1)], start=[8, 8, 0.9], global_evaluations=0, starts=0, iterations=2)
     assert not found.converged
-    assert found.stopped == "out of evaluations"
+    assert found.stopped == "no evaluations left"
 
 
 def test_a_valley_not_followed_to_its_end_is_not_called_a_minimum() -> None:
