@@ -1,4 +1,4 @@
-"""What a rotary axis and a light sensor can do, whoever made them, and the values they hand over."""
+"""What a rotary axis, a light sensor and a range finder can do, whoever made them, and the values they hand over."""
 
 from __future__ import annotations
 
@@ -121,6 +121,49 @@ class LightReading:
         return not (self.over_range or self.under_range)
 
 
+@dataclass(frozen=True)
+class DistanceReading:
+    """One reading of a range finder.
+
+    Attributes
+    ----------
+    distance_mm : float, mm
+        From the device's zero to the target; +inf when nothing was measured, so that it can never pass for a good value.
+    status : int
+        The device's status or error number, 0 when all is well.
+    out_of_range : bool
+        There is no target within the measuring range.
+    doubtful : bool
+        There is a value, but the device or the driver does not vouch for it.
+    device_time_s : float, s, optional
+        The device's own clock, if it has one; it may wrap.
+    flags : tuple of str
+        What was wrong, in words.
+
+    Raises
+    ------
+    InvalidSetting
+        If distance and out_of_range contradict each other.
+    """
+
+    distance_mm: float
+    status: int = 0
+    out_of_range: bool = False
+    doubtful: bool = False
+    device_time_s: float | None = None
+    flags: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.distance_mm) or self.distance_mm == math.inf) or math.isinf(self.distance_mm) != self.out_of_range:
+            contradiction = f"distance {self.distance_mm} mm with out_of_range={self.out_of_range}"
+            raise InvalidSetting(contradiction, expected="+inf if and only if out of range")
+
+    @property
+    def good(self) -> bool:
+        """Whether the distance can be used as a measurement."""
+        return not (self.out_of_range or self.doubtful)
+
+
 @runtime_checkable
 class RotaryAxis(Protocol):
     """A motorised rotation. Calls block for one exchange, not for a motion; any thread may call."""
@@ -222,6 +265,32 @@ class LightSensor(Protocol):
 
     def read(self) -> LightReading:
         """Take one reading; blocks for the integration."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the device. The link stays open for the others on it."""
+        ...
+
+
+@runtime_checkable
+class RangeFinder(Protocol):
+    """Something that tells how far away a surface is."""
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        ...
+
+    def identify(self) -> Identity:
+        """Ask the device who it is."""
+        ...
+
+    def limits_mm(self) -> tuple[float, float]:
+        """Nearest and farthest distance it measures, mm, from the same zero as the readings."""
+        ...
+
+    def read(self) -> DistanceReading:
+        """Take one reading, made after the call. Without a target it is flagged, not an error."""
         ...
 
     def close(self) -> None:

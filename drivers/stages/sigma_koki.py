@@ -1,0 +1,608 @@
+"""Sigma Koki (OptoSigma) rotary stages on the two-axis controllers SHOT-302GS and GSC-02.
+
+Source: open drivers of these controllers; no manual was at hand. The SHOT answers set commands with ``OK`` or ``NG``, the GSC-02 not at
+all, so there every command is followed by the status question ``Q:``, whose ACK1 tells. Nothing carries a name or checksum: the status
+has fixed columns, a resting counter is read twice, and after a missing or malformed answer the controller is asked for its version, and
+all that comes before it is dropped.
+
+A controller takes no new motion while either of its axes moves. A motion that must wait is started by the next look at the axis' state
+that finds the controller ready; until then the axis counts as moving.
+
+Not verified on hardware: everything. In particular the step (``degrees_per_pulse``), that a return to the origin leaves the counter at
+0, and the speeds a controller starts with, which it does not tell: opening an axis therefore sets them. The controllers know no travel
+limits (``low_deg``, ``high_deg``) nor whether an axis has been homed: the driver counts it as homed after a return to the origin that it
+has itself seen end at 0, and ``assume_homed`` says that it was homed before.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, TypeVar
+from weakref import WeakKeyDictionary
+
+from drivers.errors import DeviceError, DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.kinds import AxisState, Identity, MotionProfile
+from drivers.link import Link
+
+T = TypeVar("T")
+
+FULL_STEP_DEG = 0.005
+"""One step of SGSP and OSMS-60YAW stages at division 1."""
+
+_READINGS = 4
+_STATUS = re.compile(rb"([+ -] *\d+| *-\d+),([+ -] *\d+| *-\d+),([XK]),([KLMW]),([BR])")
+_COLUMNS = 27  # two counters of ten, three letters, four commas
+_DIVISIONS = re.compile(rb"\s*(\d{1,3})\s*,\s*(\d{1,3})\s*")
+_VERSION = re.compile(rb"\s*[A-Za-z][ -+\--~]*\d[ -+\--~]*")  # its form is not known: letters first, a digit, no comma
+_WORDS = (b"OK", b"NG", b"R", b"B")
+_ON_LIMIT = {"K": (), "L": (1,), "M": (2,), "W": (1, 2)}
+
+
+@dataclass(frozen=True)
+class Status:
+    """The answer to ``Q:``.
+
+    Attributes
+    ----------
+    pulses : tuple of int
+        Counters of axes 1 and 2.
+    failed : bool
+        ACK1: the last command was refused.
+    limits : tuple of int
+        ACK2: axes that a limit sensor stopped.
+    busy : bool
+        ACK3: an axis moves; which one is not told.
+    """
+
+    pulses: tuple[int, int]
+    failed: bool
+    limits: tuple[int, ...]
+    busy: bool
+
+
+def parse_status(line: bytes) -> Status:
+    """Take a status line apart, such as ``     14000,         0,K,K,R``.
+
+    Raises
+    ------
+    UnexpectedReply
+        The line has other columns.
+    """
+    match = _STATUS.fullmatch(line)
+    if match is None or len(line) != _COLUMNS or line[10:11] != b",":
+        raise UnexpectedReply("not a status", raw=line, expected="a line like '     14000,         0,K,K,R'")
+    one, two = (int(match[place].replace(b" ", b"")) for place in (1, 2))
+    return Status((one, two), match[3] == b"X", _ON_LIMIT[match[4].decode("ascii")], match[5] == b"B")
+
+
+def find_version(line: bytes) -> str | None:
+    """Take the answer to ``?:V``; None for a line that cannot be it."""
+    return line.decode("ascii").strip() if _VERSION.fullmatch(line) else None
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """What sets one controller apart from the other.
+
+    Attributes
+    ----------
+    answers : bool
+        Whether set commands are answered with ``OK`` or ``NG``.
+    go : str
+        Starts what is armed.
+    most_pulses, most_speed : int
+        Largest move, pulses, and speed, pulses/s.
+    """
+
+    model: str
+    answers: bool
+    go: str
+    most_pulses: int
+    most_speed: int
+
+
+SHOT_302GS = Dialect("SHOT-302GS", answers=True, go="G:", most_pulses=268_435_455, most_speed=500_000)
+GSC_02 = Dialect("GSC-02", answers=False, go="G", most_pulses=16_777_214, most_speed=20_000)
+DIALECTS = {dialect.model: dialect for dialect in (SHOT_302GS, GSC_02)}
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """Start speed and speed, pulses/s, and the time of a ramp, ms, as in the ``D:`` command."""
+
+    slow: int = 500
+    fast: int = 5000
+    ramp_ms: int = 200
+
+    def __str__(self) -> str:
+        return f"S{self.slow}F{self.fast}R{self.ramp_ms}"
+
+    @property
+    def acceleration(self) -> float:
+        """Pulses/s^2 with which a ramp from rest would make a long move take as long."""
+        return self.fast**2 * 1000 / (self.ramp_ms * (self.fast - self.slow))
+
+    @classmethod
+    def nearest(cls, speed: float, acceleration: float, most_speed: int) -> Speeds | None:
+        """The setting for a speed (pulses/s) and an acceleration (pulses/s^2), or None when there is none."""
+        if not (math.isfinite(speed) and math.isfinite(acceleration) and acceleration > 0 and 2 <= round(speed) <= most_speed):
+            return None
+        fast = round(speed)
+        slow = max(1, min(64, fast // 8))  # slow enough not to lose steps; from 8000 on the controller wants 64
+        if most_speed == GSC_02.most_speed and fast > 200:
+            slow = max(slow, 50)  # its upper speed range starts there
+        ramp_ms = round(1000 * fast**2 / (acceleration * (fast - slow)))
+        return cls(slow, fast, ramp_ms) if 1 <= ramp_ms <= 1000 else None
+
+
+class SigmaKokiAxis:
+    """One axis of a controller; satisfies `drivers.kinds.RotaryAxis`. Both axes share the controller's link.
+
+    `SigmaKokiAxis.open` sets the speeds; the bare constructor sends nothing.
+
+    Parameters
+    ----------
+    link : Link
+        Terminator CR LF. Stays the caller's to close.
+    name : str
+        For messages.
+    controller : str
+        ``SHOT-302GS`` or ``GSC-02``.
+    axis : int
+        1 or 2.
+    degrees_per_pulse : float
+        Scale; half steps of 0.0025 deg when not given.
+    low_deg, high_deg : float
+        Travel; moves beyond it are refused.
+    home_direction : str
+        ``+`` or ``-``: where a GSC-02 looks for the origin; a SHOT decides by its own settings.
+    assume_homed : bool
+        The axis was homed since the controller was switched on.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        name: str,
+        *,
+        controller: str = "SHOT-302GS",
+        axis: int = 1,
+        degrees_per_pulse: float = FULL_STEP_DEG / 2,
+        low_deg: float = -180.0,
+        high_deg: float = 180.0,
+        home_direction: str = "-",
+        assume_homed: bool = False,
+    ) -> None:
+        if controller not in DIALECTS or axis not in (1, 2) or home_direction not in ("+", "-"):
+            given = f"controller {controller!r}, axis {axis}, home_direction {home_direction!r}"
+            raise InvalidSetting(given, device=name, expected=f"controller {' or '.join(DIALECTS)}, axis 1 or 2, home_direction + or -")
+        if not (math.isfinite(degrees_per_pulse) and degrees_per_pulse > 0):
+            raise InvalidSetting(f"degrees_per_pulse {degrees_per_pulse}", device=name, expected="a finite number above 0")
+        if not (math.isfinite(low_deg) and math.isfinite(high_deg) and low_deg < high_deg):
+            raise InvalidSetting(f"travel {low_deg} to {high_deg} deg", device=name, expected="two finite angles, the lower one first")
+        self._dialect = DIALECTS[controller]
+        self._wire = _Wire(link, name, axis, self._dialect)
+        self._axis = axis
+        self._scale = degrees_per_pulse
+        self._travel = (low_deg, high_deg)
+        self._home_direction = home_direction
+        self._homed = assume_homed
+        self._homing = False
+        self._waiting: _Motion | None = None  # a motion for which the controller was not ready yet
+        self._stops = 0
+        self._stops_lock = threading.Lock()
+
+    @classmethod
+    def open(
+        cls,
+        link: Link,
+        name: str,
+        *,
+        controller: str = "SHOT-302GS",
+        axis: int = 1,
+        degrees_per_pulse: float | None = None,
+        low_deg: float = -180.0,
+        high_deg: float = 180.0,
+        home_direction: str = "-",
+        assume_homed: bool = False,
+        speed_deg_s: float = 12.5,
+        acceleration_deg_s2: float = 60.0,
+    ) -> SigmaKokiAxis:
+        """Meet the axis: read the division of its steps unless the scale is given, and set its speeds. Nothing moves.
+
+        Raises
+        ------
+        DeviceFault
+            The controller refuses, for instance because an axis moves.
+        """
+        stage = cls(
+            link,
+            name,
+            controller=controller,
+            axis=axis,
+            degrees_per_pulse=FULL_STEP_DEG / 2 if degrees_per_pulse is None else degrees_per_pulse,
+            low_deg=low_deg,
+            high_deg=high_deg,
+            home_direction=home_direction,
+            assume_homed=assume_homed,
+        )
+        if degrees_per_pulse is None and stage._dialect.answers:
+            stage._scale = FULL_STEP_DEG / stage._wire.division("reading the division of steps")
+        stage.set_profile(speed_deg_s, acceleration_deg_s2)
+        return stage
+
+    @property
+    def name(self) -> str:
+        """What the user calls it."""
+        return self._wire.name
+
+    @property
+    def degrees_per_pulse(self) -> float:
+        """Scale in use."""
+        return self._scale
+
+    def identify(self) -> Identity:
+        """Ask the controller for its version, all it tells about itself; the model is the one configured."""
+        version = self._wire.version("reading the version")
+        return Identity(vendor="Sigma Koki", model=f"{self._dialect.model} axis {self._axis}", serial_number="not told", firmware=version)
+
+    def state(self) -> AxisState:
+        """Ask for the status, at rest until two answers agree; and start the motion that was waiting for the controller, if it is ready."""
+        attempt = "reading the status"
+        with self._wire.lock:
+            status = self._steady_status(attempt)
+            moving = status.busy and self._wire.controller.moving in (None, self._axis)
+            if not status.busy:
+                self._wire.controller.moving = None
+                self._settle_homing(status)
+                with self._stops_lock:
+                    waiting, self._waiting = self._waiting, None
+                if waiting is not None:
+                    self._begin(waiting)
+                    moving = True
+            return AxisState(
+                position_deg=self._deg(status),
+                moving=moving or self._waiting is not None,
+                homed=self._homed,
+                warnings=("limit sensor",) if self._axis in status.limits else (),
+            )
+
+    def limits_deg(self) -> tuple[float, float]:
+        """The travel configured, deg: the controller knows none."""
+        return self._travel
+
+    def profile(self) -> MotionProfile:
+        """Speed and acceleration as they were last set: the controller does not tell."""
+        speeds = self._wire.controller.speeds[self._axis - 1]
+        return MotionProfile(speeds.fast * self._scale, speeds.acceleration * self._scale)
+
+    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
+        """Set speed (deg/s), acceleration (deg/s^2) or both, to the nearest values the controller can express.
+
+        Raises
+        ------
+        InvalidSetting
+            A value is not finite, or the controller cannot express it: its ramps take 1 to 1000 ms.
+        DeviceFault
+            The controller refuses, for instance because an axis moves.
+        """
+        if speed_deg_s is None and acceleration_deg_s2 is None:
+            return
+        attempt = "setting speed and acceleration"
+        with self._wire.lock:
+            now = self.profile()
+            speed = now.speed_deg_s if speed_deg_s is None else speed_deg_s
+            acceleration = now.acceleration_deg_s2 if acceleration_deg_s2 is None else acceleration_deg_s2
+            speeds = Speeds.nearest(speed / self._scale, acceleration / self._scale, self._dialect.most_speed)
+            if speeds is None:
+                raise InvalidSetting(
+                    f"speed {speed} deg/s, acceleration {acceleration} deg/s^2",
+                    device=self.name,
+                    attempt=attempt,
+                    expected=f"speed above 0, at most {self._dialect.most_speed * self._scale:g} deg/s, and a ramp of 1 to 1000 ms",
+                )
+            both = list(self._wire.controller.speeds)
+            both[self._axis - 1] = speeds
+            if self._dialect.answers:
+                command = f"D:{self._axis}{speeds}"
+            else:  # one command for both axes, in one of two ranges
+                command = f"D:{2 if max(each.fast for each in both) > 200 else 1}{both[0]}{both[1]}"
+            self._wire.act(command, attempt)
+            self._wire.controller.speeds = (both[0], both[1])
+
+    def start_home(self) -> None:
+        """Start the return to the mechanical origin. When it is over, `state` says ``homed``."""
+        direction = "" if self._dialect.answers else self._home_direction
+        self._homed = self._homing = False
+        self._start(_Motion((f"C:{self._axis}1", f"H:{self._axis}{direction}"), "starting to home", self._stops, homes=True))
+
+    def start_move(self, deg: float) -> None:
+        """Start an absolute move (deg), or have it wait until the controller's other axis rests.
+
+        Raises
+        ------
+        InvalidSetting
+            The angle is not a finite number, or too many pulses for one command.
+        NotHomed
+            The axis has not been homed.
+        DeviceFault
+            The angle is beyond the travel; or this axis moves; or the controller refuses. Or `stop` came between.
+        TransportTimeout, UnexpectedReply
+            It is unknown whether the axis moves: stop it.
+        """
+        if not math.isfinite(deg):
+            raise InvalidSetting(f"angle {deg}", device=self.name, attempt="starting to move", expected="a finite angle in degrees")
+        attempt = f"starting to move to {deg:.4f} deg"
+        stops = self._stops
+        if not self._homed:
+            raise self._wire.fault("no reference position", attempt, kind=NotHomed, expected="a homed axis", hint="home the axis first")
+        low, high = self._travel
+        if not low <= deg <= high:
+            raise self._wire.fault(f"{deg:.4f} deg is beyond the travel", attempt, expected=f"{low:g} to {high:g} deg")
+        pulses = round(deg / self._scale)
+        if abs(pulses) > self._dialect.most_pulses:
+            raise InvalidSetting(f"{pulses} pulses", device=self.name, attempt=attempt, expected=f"at most {self._dialect.most_pulses}")
+        arm = f"A:{self._axis}{'-' if pulses < 0 else '+'}P{abs(pulses)}"
+        self._start(_Motion((arm, self._dialect.go), attempt, stops))
+
+    def stop(self) -> None:
+        """Tell the axis to decelerate to rest, now; forget a motion that waits. Returns when the controller has answered.
+
+        The bytes go out at once, even while other threads wait on the link. An unanswered stop is sent once more.
+        """
+        with self._stops_lock:
+            self._stops += 1
+            self._homing = False
+            self._waiting = None
+        self._wire.stop()
+
+    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
+        """Make sure that the axis rests at an angle (deg) because it got there.
+
+        Raises
+        ------
+        DeviceFault
+            A limit sensor stopped the axis; or it still moves; or it rests further than `tolerance_deg` from the angle.
+        """
+        state = self.state()
+        attempt = f"arriving at {deg:.4f} deg"
+        if state.warnings:
+            raise self._wire.fault(
+                f"stopped by a limit sensor at {state.position_deg:.4f} deg",
+                attempt,
+                expected="an undisturbed motion",
+                hint="look for what is in the way, then home the axis",
+            )
+        if state.moving:
+            raise self._wire.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
+        if not abs(state.position_deg - deg) <= tolerance_deg:
+            raise self._wire.fault(
+                f"rests at {state.position_deg:.4f} deg",
+                attempt,
+                expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
+                hint="was it stopped, or moved by hand?",
+            )
+
+    def close(self) -> None:
+        """Let go of the axis without moving it. The link stays open for the other one."""
+        self._wire.closed = True
+
+    def _deg(self, status: Status) -> float:
+        return status.pulses[self._axis - 1] * self._scale
+
+    def _steady_status(self, attempt: str) -> Status:
+        """The status; of a controller at rest once two in turn agree: a digit damaged on the line must not pass for another angle."""
+        statuses = [self._wire.status(attempt)]
+        while statuses[-1].busy is False:
+            statuses.append(self._wire.status(attempt))
+            if statuses[-1] == statuses[-2]:
+                break
+            if len(statuses) == _READINGS:
+                seen = ", ".join(f"{self._deg(status):.4f}" for status in statuses)
+                raise UnexpectedReply(
+                    f"positions {seen} deg at rest",
+                    device=self.name,
+                    port=self._wire.url,
+                    attempt=attempt,
+                    expected="two in turn that agree",
+                    hint="check the cable",
+                )
+        return statuses[-1]
+
+    def _settle_homing(self, status: Status) -> None:
+        with self._stops_lock:
+            if self._homing:
+                self._homed, self._homing = status.pulses[self._axis - 1] == 0, False
+
+    def _start(self, motion: _Motion) -> None:
+        with self._wire.lock:
+            status = self._wire.status(motion.attempt)
+            if status.busy and self._wire.controller.moving != 3 - self._axis:
+                raise self._wire.fault("the controller is busy", motion.attempt, expected="an axis at rest", hint="wait, or stop the axis")
+            if status.busy:
+                with self._stops_lock:
+                    if self._stops == motion.stops:
+                        self._waiting = motion
+                        return
+            self._begin(motion)
+
+    def _begin(self, motion: _Motion) -> None:
+        """Send a motion's commands, unless `stop` was called since: a stop must not be followed by an older motion."""
+
+        def veto() -> DeviceError | None:
+            stopped = self._stops != motion.stops
+            return self._wire.fault("stopped before it could start; nothing was sent", motion.attempt) if stopped else None
+
+        for command in motion.commands:
+            self._wire.act(command, motion.attempt, veto=veto)
+        self._wire.controller.moving = self._axis
+        with self._stops_lock:
+            self._homing = motion.homes and self._stops == motion.stops
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """The commands that start a motion, and how often the axis had been stopped when it was asked for."""
+
+    commands: tuple[str, ...]
+    attempt: str
+    stops: int
+    homes: bool = False
+
+
+@dataclass
+class _Controller:
+    """What both axes on one link have in common."""
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    in_doubt: bool = True  # whether an unclaimed answer may still be on its way
+    moving: int | None = None  # the axis started last, while the controller is busy
+    speeds: tuple[Speeds, Speeds] = (Speeds(), Speeds())
+
+
+class _Wire:
+    """Questions and answers with one axis' controller."""
+
+    # Axes are opened one by one, yet share the controller's one line of answers and its one busy flag.
+    _controllers: ClassVar[WeakKeyDictionary[Link, _Controller]] = WeakKeyDictionary()
+    _finding: ClassVar[threading.Lock] = threading.Lock()
+
+    def __init__(self, link: Link, name: str, axis: int, dialect: Dialect) -> None:
+        self.name = name
+        self.closed = False
+        self._axis = axis
+        self._link = link
+        self._dialect = dialect
+        with self._finding:
+            self.controller = self._controllers.setdefault(link, _Controller())
+
+    @property
+    def url(self) -> str:
+        """The port, for messages."""
+        return self._link.url
+
+    @property
+    def lock(self) -> threading.RLock:
+        """Held for whole sequences, but never by a stop."""
+        return self.controller.lock
+
+    def status(self, attempt: str) -> Status:
+        """Ask for the status."""
+        return self._read("Q:", _status_or_not_ours, attempt, "a status")
+
+    def division(self, attempt: str) -> int:
+        """Ask for the division of the axis' steps."""
+
+        def accept(line: bytes) -> int | None:
+            if line in _WORDS[2:] or _STATUS.fullmatch(line):
+                return None
+            match = _DIVISIONS.fullmatch(line)
+            if match is None or not int(match[self._axis]):
+                raise UnexpectedReply("no divisions", raw=line, expected="two numbers like '2,2'", hint="give degrees_per_pulse")
+            return int(match[self._axis])
+
+        return self._read("?:SW", accept, attempt, "two numbers like '2,2'")
+
+    def version(self, attempt: str) -> str:
+        """Ask for the version, dropping all that comes before: the controller answers in order, so nothing is owed us then."""
+        with self.lock:
+            found = self._exchange("?:V", find_version, attempt, "a version", repeatable=True)
+            self.controller.in_doubt = False
+        return found
+
+    def act(self, command: str, attempt: str, *, veto: Callable[[], DeviceError | None] | None = None) -> None:
+        """Send a command that changes something, once, and make sure that the controller took it."""
+        with self.lock:
+            self._settle_doubt(attempt)
+            try:
+                taken = self._command(command, attempt, veto=veto)
+            except (TransportTimeout, UnexpectedReply):
+                self.controller.in_doubt = True
+                raise
+        if not taken:
+            raise self.fault(f"{command} was refused", attempt, expected="OK", hint="is an axis still moving, or its motor switched off?")
+
+    def stop(self) -> None:
+        """Send the stop, past whoever waits on the link."""
+        command, attempt = f"L:{self._axis}", "stopping"
+        try:
+            taken = self._command(command, attempt, urgent=True)
+        except (TransportTimeout, UnexpectedReply):
+            self.controller.in_doubt = True
+            taken = self._command(command, attempt, urgent=True)
+        if not taken and self._dialect.answers:
+            raise self.fault(f"{command} was refused", attempt, expected="OK", hint="check the controller's command mode")
+
+    def fault(
+        self, problem: str, attempt: str, *, kind: type[DeviceFault] = DeviceFault, expected: str = "", hint: str = ""
+    ) -> DeviceFault:
+        """Make the error for what the controller reports."""
+        return kind(problem, device=self.name, port=self.url, attempt=attempt, expected=expected, hint=hint)
+
+    def _command(self, command: str, attempt: str, *, urgent: bool = False, veto: Callable[[], DeviceError | None] | None = None) -> bool:
+        """Send a command and say whether it was taken."""
+        if self._dialect.answers:
+            word: Literal["OK", "NG"] = self._exchange(command, _word_or_not_ours, attempt, "OK or NG", urgent=urgent, veto=veto)
+            return word == "OK"
+        status = self._exchange(f"{command}\r\nQ:", _status_or_not_ours, attempt, "a status", urgent=urgent, veto=veto)
+        return not status.failed
+
+    def _read(self, question: str, accept: Callable[[bytes], T | None], attempt: str, expected: str) -> T:
+        """Ask something that may safely be asked twice."""
+        with self.lock:
+            for last in (False, True):
+                self._settle_doubt(attempt)
+                try:
+                    return self._exchange(question, accept, attempt, expected)
+                except (TransportTimeout, UnexpectedReply):
+                    self.controller.in_doubt = True
+                    if last:
+                        raise
+        raise AssertionError("not reached")
+
+    def _settle_doubt(self, attempt: str) -> None:
+        if self.controller.in_doubt:
+            self.version(attempt)
+
+    def _exchange(
+        self,
+        message: str,
+        accept: Callable[[bytes], T | None],
+        attempt: str,
+        expected: str,
+        *,
+        repeatable: bool = False,
+        urgent: bool = False,
+        veto: Callable[[], DeviceError | None] | None = None,
+    ) -> T:
+        if self.closed:
+            raise PortClosed("the device was closed", device=self.name, port=self.url, attempt=attempt, hint="open it again")
+        return self._link.exchange(
+            message.encode("ascii") + b"\r\n",
+            accept,
+            attempt=attempt,
+            expected=expected,
+            device=self.name,
+            repeatable=repeatable,
+            urgent=urgent,
+            veto=veto,
+        )
+
+
+def _status_or_not_ours(line: bytes) -> Status | None:
+    """Leave the answer to a stop that overtook to the stop."""
+    return None if line in _WORDS else parse_status(line)
+
+
+def _word_or_not_ours(line: bytes) -> Literal["OK", "NG"] | None:
+    if line == b"OK":
+        return "OK"
+    if line == b"NG":
+        return "NG"
+    if _STATUS.fullmatch(line) or _DIVISIONS.fullmatch(line):
+        return None
+    raise UnexpectedReply("no acknowledgement", raw=line, expected="OK or NG")
