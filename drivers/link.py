@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import serial
 
 T = TypeVar("T")
+S = TypeVar("S")
 Traffic = Callable[[float, Literal["tx", "rx"], bytes], None]
 
 TERMINATORS = {"CR": b"\r", "LF": b"\n", "CRLF": b"\r\n", "LFCR": b"\n\r"}
@@ -103,6 +104,7 @@ class Link:
         self._closed = False
         self._changed = threading.Condition(self._state)
         self._buffer = b""
+        self._shared: dict[Callable[[], Any], Any] = {}
         self._fd = _file_descriptor(port)
         if self._fd is None:
             port.timeout = _SLICE_S
@@ -169,6 +171,17 @@ class Link:
                 self._changed.wait()
         with self._write_lock:
             self._port.close()
+
+    def shared(self, kind: Callable[[], S]) -> S:
+        """Return what all devices of a kind on this link have in common: made by `kind` for the first, the same for the others.
+
+        Axes are opened one by one, yet their controller may have one line of answers, one error queue, one busy flag.
+        """
+        with self._state:
+            if kind not in self._shared:
+                self._shared[kind] = kind()
+            found: S = self._shared[kind]
+        return found
 
     def exchange(
         self,

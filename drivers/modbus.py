@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import struct
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -29,10 +29,9 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
+from drivers.endpoint import Endpoint, Veto
 from drivers.errors import BadChecksum, DeviceError, DeviceFault, InvalidSetting, PortClosed, TransportTimeout, UnexpectedReply
 from drivers.link import Link
-
-Veto = Callable[[], DeviceError | None]
 
 MOST_READ = 125
 MOST_WRITTEN = 123
@@ -301,7 +300,7 @@ class ModbusLink(Link):
             raise TransportTimeout("no reply before a stop had to go out", raw=self._client.heard, hint="ask the device for its state")
 
 
-class ModbusUnit:
+class ModbusUnit(Endpoint):
     """One device on a Modbus link, at its address.
 
     Parameters
@@ -326,10 +325,9 @@ class ModbusUnit:
             raise InvalidSetting("a link that does not speak Modbus", device=name, port=link.url, expected="a ModbusLink")
         if not 1 <= address <= 247:
             raise InvalidSetting(f"address {address}", device=name, port=link.url, expected="1 to 247")
-        self.name = name
+        super().__init__(link, name)
         self.address = address
-        self.closed = False
-        self._link = link
+        self._modbus = link
         self._step = 1 if high_word_first else -1
 
     def holding(self, address: int, count: int, attempt: str) -> tuple[int, ...]:
@@ -405,16 +403,6 @@ class ModbusUnit:
         """
         return self._words(values, "f")
 
-    def fault(
-        self, problem: str, attempt: str, *, kind: type[DeviceFault] = DeviceFault, expected: str = "", hint: str = ""
-    ) -> DeviceFault:
-        """Make the error for what the device reports."""
-        return kind(problem, device=self.name, port=self._link.url, attempt=attempt, expected=expected, hint=hint)
-
-    def unexpected(self, problem: str, attempt: str, expected: str) -> UnexpectedReply:
-        """Make the error for registers that make no sense."""
-        return UnexpectedReply(problem, device=self.name, port=self._link.url, attempt=attempt, expected=expected)
-
     def _registers(self, kind: type[ReadHoldingRegistersRequest], address: int, count: int, attempt: str) -> tuple[int, ...]:
         self._check(address, count, MOST_READ, attempt)
         return tuple(self._ask(kind(dev_id=self.address, address=address, count=count), attempt, repeatable=True).registers)
@@ -422,9 +410,8 @@ class ModbusUnit:
     def _ask(
         self, request: ModbusPDU, attempt: str, *, repeatable: bool = False, urgent: bool = False, veto: Veto | None = None
     ) -> ModbusPDU:
-        if self.closed:
-            raise PortClosed("the device was closed", device=self.name, port=self._link.url, attempt=attempt, hint="open it again")
-        return self._link.ask(request, attempt=attempt, device=self.name, repeatable=repeatable, urgent=urgent, veto=veto)
+        self.require_open(attempt)
+        return self._modbus.ask(request, attempt=attempt, device=self.name, repeatable=repeatable, urgent=urgent, veto=veto)
 
     def _check(self, address: int, count: int, most: int, attempt: str, registers: Sequence[int] = ()) -> None:
         if not (0 <= address <= 0xFFFF and 1 <= count <= most and address + count <= 0x10000):

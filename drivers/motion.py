@@ -1,10 +1,12 @@
-"""Waiting for an axis to come to rest."""
+"""What every motion owes: no start after a stop, a wait that ends stopped, an arrival that is made sure of."""
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Protocol
 
+from drivers.endpoint import Endpoint, Veto
 from drivers.errors import DeviceError, MoveTimeout
 from drivers.kinds import AxisState, RotaryAxis
 
@@ -21,6 +23,42 @@ class Clock(Protocol):
     def sleep(self, seconds: float, /) -> None:
         """Wait."""
         ...
+
+
+class Stops:
+    """How often an axis was told to stop, so that no stop is followed by an older start.
+
+    Attributes
+    ----------
+    lock : Lock
+        Held while it is counted; for what must agree with the count.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.count = 0
+
+    def veto(self, endpoint: Endpoint, attempt: str, count: int | None = None) -> Veto:
+        """Make the objection to a start whose turn comes after a stop that was called since `count`, by default since now."""
+        known = self.count if count is None else count
+
+        def veto() -> DeviceError | None:
+            return endpoint.fault("stopped before it could start; nothing was sent", attempt) if self.count != known else None
+
+        return veto
+
+
+def require_arrival(endpoint: Endpoint, state: AxisState, deg: float, tolerance_deg: float, attempt: str) -> None:
+    """Raise DeviceFault unless an axis rests, and within `tolerance_deg` of an angle (deg)."""
+    if state.moving:
+        raise endpoint.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
+    if not abs(state.position_deg - deg) <= tolerance_deg:
+        raise endpoint.fault(
+            f"rests at {state.position_deg:.4f} deg",
+            attempt,
+            expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
+            hint="was it stopped, or moved by hand?",
+        )
 
 
 def wait_until_idle(axis: RotaryAxis, expected_s: float, *, timeout_s: float, clock: Clock = time) -> AxisState:

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar, TypeVar
-from weakref import WeakKeyDictionary
+from typing import TypeVar
 
-from drivers.errors import DeviceError, DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.doubt import Doubt
+from drivers.endpoint import Endpoint, Veto
+from drivers.errors import InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
 from drivers.kinds import AxisState, Identity, MotionProfile
 from drivers.link import Link
+from drivers.motion import Stops, require_arrival
 
 T = TypeVar("T")
 
@@ -154,8 +155,7 @@ class NewportAxis:
         self._homed = assume_homed
         self._homing = False
         self._seen = len(self._wire.errors)  # errors of earlier motions
-        self._stops = 0
-        self._stops_lock = threading.Lock()
+        self._stops = Stops()
 
     @classmethod
     def open(
@@ -224,7 +224,7 @@ class NewportAxis:
         self._wire.drain(attempt)
         warnings = self._warnings()
         position = self._steady_position(attempt)
-        with self._stops_lock:
+        with self._stops.lock:
             if self._homing:
                 self._homed, self._homing = not warnings, False
             if not powered:
@@ -286,14 +286,14 @@ class NewportAxis:
     def start_home(self) -> None:
         """Switch the motor on and start the search for the reference. When it is over, `state` says ``homed``."""
         attempt = "starting to home"
-        veto, stops = self._vetoing(attempt), self._stops
+        veto, stops = self._stops.veto(self._wire, attempt), self._stops.count
         self._wire.drain(attempt)
         self._seen = len(self._wire.errors)
         self._homed = self._homing = False
         self._wire.act("MO", "switching the motor on", veto=veto)
         self._wire.act(f"OR{self._home_search}", attempt, veto=veto)
-        with self._stops_lock:
-            self._homing = self._stops == stops  # only a search that nobody stopped gives a reference
+        with self._stops.lock:
+            self._homing = self._stops.count == stops  # only a search that nobody stopped gives a reference
 
     def start_move(self, deg: float) -> None:
         """Start an absolute move (deg).
@@ -312,7 +312,7 @@ class NewportAxis:
         attempt = f"starting to move to {deg:.4f} deg"
         if not math.isfinite(deg):
             raise InvalidSetting(f"angle {deg}", device=self.name, attempt="starting to move", expected="a finite angle in degrees")
-        veto = self._vetoing(attempt)
+        veto = self._stops.veto(self._wire, attempt)
         if self._homed and not self._wire.flag("MO?", attempt):
             self._homed = False
         if not self._homed:
@@ -332,8 +332,8 @@ class NewportAxis:
 
         The bytes go out at once, even while other threads wait on the link. An unanswered stop is sent once more.
         """
-        with self._stops_lock:
-            self._stops += 1
+        with self._stops.lock:
+            self._stops.count += 1
             self._homing = False
         self._wire.stop()
 
@@ -356,15 +356,7 @@ class NewportAxis:
                 expected="an undisturbed motion",
                 hint=_HINTS.get(code % 100, "") if code >= 100 else "find the cause, then home the axis",
             )
-        if state.moving:
-            raise self._wire.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
-        if not abs(state.position_deg - deg) <= tolerance_deg:
-            raise self._wire.fault(
-                f"rests at {state.position_deg:.4f} deg",
-                attempt,
-                expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
-                hint="was it stopped, or moved by hand?",
-            )
+        require_arrival(self._wire, state, deg, tolerance_deg, attempt)
 
     def close(self) -> None:
         """Let go of the axis without moving it. The link stays open for the others on it."""
@@ -381,57 +373,31 @@ class NewportAxis:
             if abs(readings[-1] - readings[-2]) <= STEADY_DEG:
                 return readings[-1]
         seen = ", ".join(f"{reading:.4f}" for reading in readings)
-        raise UnexpectedReply(
-            f"positions {seen} deg of an axis at rest",
-            device=self.name,
-            port=self._wire.url,
-            attempt=attempt,
-            expected=f"two in turn that agree to {STEADY_DEG:g} deg",
-            hint="check the cable",
+        raise self._wire.unexpected(
+            f"positions {seen} deg of an axis at rest", attempt, f"two in turn that agree to {STEADY_DEG:g} deg", hint="check the cable"
         )
 
     def _warnings(self) -> tuple[str, ...]:
         """What this axis or the whole controller complained of since the last start of a motion."""
         return tuple(str(error) for error in self._wire.errors[self._seen :] if error.axis in (0, self._wire.axis))
 
-    def _vetoing(self, attempt: str) -> Callable[[], DeviceError | None]:
-        """Make the objection to a motion whose turn comes after a `stop` that was called meanwhile."""
-        stops = self._stops
-
-        def veto() -> DeviceError | None:
-            return self._wire.fault("stopped before it could start; nothing was sent", attempt) if self._stops != stops else None
-
-        return veto
-
 
 @dataclass
 class _Controller:
     """What all axes on one link have in common."""
 
-    lock: threading.RLock = field(default_factory=threading.RLock)
-    in_doubt: bool = True  # whether an unclaimed answer may still be on its way
+    doubt: Doubt = field(default_factory=Doubt)
     errors: list[EspError] = field(default_factory=list)  # all that were read, but those that answer a command
 
 
-class _Wire:
+class _Wire(Endpoint):
     """Questions and answers with one axis."""
 
-    # Axes are opened one by one, yet their controller has one error queue and one line of answers.
-    _controllers: ClassVar[WeakKeyDictionary[Link, _Controller]] = WeakKeyDictionary()
-    _finding: ClassVar[threading.Lock] = threading.Lock()
-
     def __init__(self, link: Link, name: str, axis: int) -> None:
-        self.name = name
+        super().__init__(link, name)
         self.axis = axis
-        self.closed = False
-        self._link = link
-        with self._finding:
-            self._controller = self._controllers.setdefault(link, _Controller())
-
-    @property
-    def url(self) -> str:
-        """The port, for messages."""
-        return self._link.url
+        self._controller = link.shared(_Controller)
+        self._doubt = self._controller.doubt
 
     @property
     def errors(self) -> list[EspError]:
@@ -470,24 +436,22 @@ class _Wire:
 
     def version(self, attempt: str) -> tuple[str, str]:
         """Ask the controller for its name and version, dropping all that comes before: it answers in order, so nothing is owed us then."""
-        with self._controller.lock:
+        with self._doubt.lock:
             found = self._exchange("VE?", find_version, attempt, "a version like 'ESP301 Version 3.0'", repeatable=True)
-            self._controller.in_doubt = False
+            self._doubt.settled()
         return found
 
     def drain(self, attempt: str) -> None:
         """Read the controller's error queue until it is empty, and keep what it held."""
         self.errors.extend(self._rest_of_queue(self._next_error(attempt), attempt))
 
-    def act(self, command: str, attempt: str, *, veto: Callable[[], DeviceError | None] | None = None) -> None:
+    def act(self, command: str, attempt: str, *, veto: Veto | None = None) -> None:
         """Send a command that changes something, once, and make sure that the controller took it."""
-        with self._controller.lock:
-            self._settle_doubt(attempt)
-            try:
-                first = self._exchange(f"{self.axis}{command};TB?", _error_or_not_ours, attempt, _ERROR_LINE, veto=veto)
-            except (TransportTimeout, UnexpectedReply):
-                self._controller.in_doubt = True
-                raise
+        with self._doubt.lock:
+            message = f"{self.axis}{command};TB?"
+            first = self._doubt.once(
+                lambda: self._exchange(message, _error_or_not_ours, attempt, _ERROR_LINE, veto=veto), lambda: self.version(attempt)
+            )
             errors = self._rest_of_queue(first, attempt)
         refusals = [error for error in errors if error.axis in (0, self.axis) and error.code not in _NOT_OF_ONE_COMMAND]
         # What happened to other axes, or to all of them, is theirs to find.
@@ -505,16 +469,10 @@ class _Wire:
         try:
             error = self._exchange(f"{self.axis}ST;TB?", _error_or_not_ours, "stopping", _ERROR_LINE, urgent=True)
         except (TransportTimeout, UnexpectedReply):
-            self._controller.in_doubt = True
+            self._doubt.arises()
             error = self._exchange(f"{self.axis}ST;TB?", _error_or_not_ours, "stopping", _ERROR_LINE, urgent=True)
         if error.code:
             self.errors.append(error)
-
-    def fault(
-        self, problem: str, attempt: str, *, kind: type[DeviceFault] = DeviceFault, expected: str = "", hint: str = ""
-    ) -> DeviceFault:
-        """Make the error for what the controller reports."""
-        return kind(problem, device=self.name, port=self.url, attempt=attempt, expected=expected, hint=hint)
 
     def _next_error(self, attempt: str) -> EspError:
         return self._read("TB?", _error_or_not_ours, attempt, _ERROR_LINE)
@@ -532,20 +490,7 @@ class _Wire:
 
     def _read(self, question: str, accept: Callable[[bytes], T | None], attempt: str, expected: str) -> T:
         """Ask something that may safely be asked twice."""
-        with self._controller.lock:
-            for last in (False, True):
-                self._settle_doubt(attempt)
-                try:
-                    return self._exchange(question, accept, attempt, expected)
-                except (TransportTimeout, UnexpectedReply):
-                    self._controller.in_doubt = True
-                    if last:
-                        raise
-        raise AssertionError("not reached")
-
-    def _settle_doubt(self, attempt: str) -> None:
-        if self._controller.in_doubt:
-            self.version(attempt)
+        return self._doubt.twice(lambda: self._exchange(question, accept, attempt, expected), lambda: self.version(attempt))
 
     def _exchange(
         self,
@@ -556,20 +501,9 @@ class _Wire:
         *,
         repeatable: bool = False,
         urgent: bool = False,
-        veto: Callable[[], DeviceError | None] | None = None,
+        veto: Veto | None = None,
     ) -> T:
-        if self.closed:
-            raise PortClosed("the device was closed", device=self.name, port=self.url, attempt=attempt, hint="open it again")
-        return self._link.exchange(
-            message.encode("ascii") + b"\r",
-            accept,
-            attempt=attempt,
-            expected=expected,
-            device=self.name,
-            repeatable=repeatable,
-            urgent=urgent,
-            veto=veto,
-        )
+        return self.exchange(message.encode("ascii") + b"\r", accept, attempt, expected, repeatable=repeatable, urgent=urgent, veto=veto)
 
 
 def _or_not_ours(parse: Callable[[bytes], T], *others: re.Pattern[bytes]) -> Callable[[bytes], T | None]:

@@ -12,13 +12,13 @@ starts again (a motion is never sent twice), the exception code of a refused sta
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Callable
 
-from drivers.errors import DeviceError, DeviceFault, InvalidSetting, NotHomed
+from drivers.endpoint import Veto
+from drivers.errors import DeviceFault, InvalidSetting, NotHomed
 from drivers.kinds import AxisState, Identity, MotionProfile
 from drivers.link import Link
 from drivers.modbus import ModbusUnit
+from drivers.motion import Stops, require_arrival
 
 STEPS_PER_DEGREE = 50.0
 """0.02 deg a step: 1000 steps a turn of the motor and the 18:1 gear of a DGM85R or DGM130R. The gear is unverified: hence an option."""
@@ -122,8 +122,7 @@ class OrientalAxis:
         self._home_end_holds = home_end_holds
         self._was_home = False
         self._profile = MotionProfile(20.0, 100.0)
-        self._stops = 0
-        self._stops_lock = threading.Lock()
+        self._stops = Stops()
         self._input_left_on = False
         if profile is not None:
             self.set_profile(profile.speed_deg_s, profile.acceleration_deg_s2)
@@ -219,7 +218,7 @@ class OrientalAxis:
             There is an alarm, or the driver is not ready; or `stop` came between.
         """
         attempt = "starting to home"
-        veto = self._veto(attempt)
+        veto = self._stops.veto(self._unit, attempt)
         self._make_ready(attempt)
         self._was_home = False
         self._pulse(self._home, attempt, veto=veto)
@@ -243,7 +242,7 @@ class OrientalAxis:
         low, high = self._limits
         if not (math.isfinite(deg) and low <= deg <= high):
             raise InvalidSetting(f"angle {deg}", device=self.name, attempt=attempt, expected=f"{low:g} to {high:g} deg")
-        veto = self._veto(attempt)
+        veto = self._stops.veto(self._unit, attempt)
         outputs, alarm = self._make_ready(attempt)
         if not self._homed(outputs, alarm):
             raise self._not_homed("HOME-END is off", attempt)
@@ -258,8 +257,8 @@ class OrientalAxis:
 
         The bytes go out ahead of all that waits for the port. An unacknowledged stop is sent once more.
         """
-        with self._stops_lock:
-            self._stops += 1
+        with self._stops.lock:
+            self._stops.count += 1
         self._pulse(_STOP, "stopping", urgent=True)
 
     def check_arrival(self, deg: float, tolerance_deg: float) -> None:
@@ -273,15 +272,7 @@ class OrientalAxis:
         attempt = f"arriving at {deg:.4f} deg"
         self._refuse_alarm(*self._outputs(attempt), attempt)
         state = self.state()
-        if state.moving:
-            raise self._unit.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
-        if not abs(state.position_deg - deg) <= tolerance_deg:
-            raise self._unit.fault(
-                f"rests at {state.position_deg:.4f} deg",
-                attempt,
-                expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
-                hint="was it stopped, or moved by hand?",
-            )
+        require_arrival(self._unit, state, deg, tolerance_deg, attempt)
 
     def reset_alarm(self) -> None:
         """Clear the alarm; its cause must be gone.
@@ -341,7 +332,7 @@ class OrientalAxis:
             f"no reference position: {problem}", attempt, kind=NotHomed, expected="HOME-END on", hint="home the axis first"
         )
 
-    def _pulse(self, bit: int, attempt: str, *, urgent: bool = False, veto: Callable[[], DeviceError | None] | None = None) -> None:
+    def _pulse(self, bit: int, attempt: str, *, urgent: bool = False, veto: Veto | None = None) -> None:
         """Raise an input and lower it again: only the rising edge counts. A stop may be sent twice, a start never."""
         self._input_left_on = True
         self._unit.write_one(_INPUT, bit, attempt, repeatable=urgent, urgent=urgent, veto=veto)
@@ -350,12 +341,3 @@ class OrientalAxis:
     def _clear_input(self, attempt: str, *, urgent: bool) -> None:
         self._unit.write_one(_INPUT, 0, attempt, repeatable=True, urgent=urgent)
         self._input_left_on = False
-
-    def _veto(self, attempt: str) -> Callable[[], DeviceFault | None]:
-        """Drop a start that `stop` overtakes: a stop must not be followed by an older motion."""
-        stops = self._stops
-
-        def veto() -> DeviceFault | None:
-            return self._unit.fault("stopped before it could start; nothing was sent", attempt) if self._stops != stops else None
-
-        return veto

@@ -21,12 +21,14 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, TypeVar
-from weakref import WeakKeyDictionary
+from typing import Literal, TypeVar
 
-from drivers.errors import DeviceError, DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.doubt import Doubt
+from drivers.endpoint import Endpoint, Veto
+from drivers.errors import InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
 from drivers.kinds import AxisState, Identity, MotionProfile
 from drivers.link import Link
+from drivers.motion import Stops, require_arrival
 
 T = TypeVar("T")
 
@@ -193,8 +195,7 @@ class SigmaKokiAxis:
         self._homed = assume_homed
         self._homing = False
         self._waiting: _Motion | None = None  # a motion for which the controller was not ready yet
-        self._stops = 0
-        self._stops_lock = threading.Lock()
+        self._stops = Stops()
 
     @classmethod
     def open(
@@ -259,7 +260,7 @@ class SigmaKokiAxis:
             if not status.busy:
                 self._wire.controller.moving = None
                 self._settle_homing(status)
-                with self._stops_lock:
+                with self._stops.lock:
                     waiting, self._waiting = self._waiting, None
                 if waiting is not None:
                     self._begin(waiting)
@@ -318,7 +319,7 @@ class SigmaKokiAxis:
         """Start the return to the mechanical origin. When it is over, `state` says ``homed``."""
         direction = "" if self._dialect.answers else self._home_direction
         self._homed = self._homing = False
-        self._start(_Motion((f"C:{self._axis}1", f"H:{self._axis}{direction}"), "starting to home", self._stops, homes=True))
+        self._start(_Motion((f"C:{self._axis}1", f"H:{self._axis}{direction}"), "starting to home", self._stops.count, homes=True))
 
     def start_move(self, deg: float) -> None:
         """Start an absolute move (deg), or have it wait until the controller's other axis rests.
@@ -337,7 +338,7 @@ class SigmaKokiAxis:
         if not math.isfinite(deg):
             raise InvalidSetting(f"angle {deg}", device=self.name, attempt="starting to move", expected="a finite angle in degrees")
         attempt = f"starting to move to {deg:.4f} deg"
-        stops = self._stops
+        stops = self._stops.count
         if not self._homed:
             raise self._wire.fault("no reference position", attempt, kind=NotHomed, expected="a homed axis", hint="home the axis first")
         low, high = self._travel
@@ -354,8 +355,8 @@ class SigmaKokiAxis:
 
         The bytes go out at once, even while other threads wait on the link. An unanswered stop is sent once more.
         """
-        with self._stops_lock:
-            self._stops += 1
+        with self._stops.lock:
+            self._stops.count += 1
             self._homing = False
             self._waiting = None
         self._wire.stop()
@@ -377,15 +378,7 @@ class SigmaKokiAxis:
                 expected="an undisturbed motion",
                 hint="look for what is in the way, then home the axis",
             )
-        if state.moving:
-            raise self._wire.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
-        if not abs(state.position_deg - deg) <= tolerance_deg:
-            raise self._wire.fault(
-                f"rests at {state.position_deg:.4f} deg",
-                attempt,
-                expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
-                hint="was it stopped, or moved by hand?",
-            )
+        require_arrival(self._wire, state, deg, tolerance_deg, attempt)
 
     def close(self) -> None:
         """Let go of the axis without moving it. The link stays open for the other one."""
@@ -403,18 +396,11 @@ class SigmaKokiAxis:
                 break
             if len(statuses) == _READINGS:
                 seen = ", ".join(f"{self._deg(status):.4f}" for status in statuses)
-                raise UnexpectedReply(
-                    f"positions {seen} deg at rest",
-                    device=self.name,
-                    port=self._wire.url,
-                    attempt=attempt,
-                    expected="two in turn that agree",
-                    hint="check the cable",
-                )
+                raise self._wire.unexpected(f"positions {seen} deg at rest", attempt, "two in turn that agree", hint="check the cable")
         return statuses[-1]
 
     def _settle_homing(self, status: Status) -> None:
-        with self._stops_lock:
+        with self._stops.lock:
             if self._homing:
                 self._homed, self._homing = status.pulses[self._axis - 1] == 0, False
 
@@ -424,24 +410,20 @@ class SigmaKokiAxis:
             if status.busy and self._wire.controller.moving != 3 - self._axis:
                 raise self._wire.fault("the controller is busy", motion.attempt, expected="an axis at rest", hint="wait, or stop the axis")
             if status.busy:
-                with self._stops_lock:
-                    if self._stops == motion.stops:
+                with self._stops.lock:
+                    if self._stops.count == motion.stops:
                         self._waiting = motion
                         return
             self._begin(motion)
 
     def _begin(self, motion: _Motion) -> None:
         """Send a motion's commands, unless `stop` was called since: a stop must not be followed by an older motion."""
-
-        def veto() -> DeviceError | None:
-            stopped = self._stops != motion.stops
-            return self._wire.fault("stopped before it could start; nothing was sent", motion.attempt) if stopped else None
-
+        veto = self._stops.veto(self._wire, motion.attempt, motion.stops)
         for command in motion.commands:
             self._wire.act(command, motion.attempt, veto=veto)
         self._wire.controller.moving = self._axis
-        with self._stops_lock:
-            self._homing = motion.homes and self._stops == motion.stops
+        with self._stops.lock:
+            self._homing = motion.homes and self._stops.count == motion.stops
 
 
 @dataclass(frozen=True)
@@ -458,37 +440,25 @@ class _Motion:
 class _Controller:
     """What both axes on one link have in common."""
 
-    lock: threading.RLock = field(default_factory=threading.RLock)
-    in_doubt: bool = True  # whether an unclaimed answer may still be on its way
+    doubt: Doubt = field(default_factory=Doubt)
     moving: int | None = None  # the axis started last, while the controller is busy
     speeds: tuple[Speeds, Speeds] = (Speeds(), Speeds())
 
 
-class _Wire:
+class _Wire(Endpoint):
     """Questions and answers with one axis' controller."""
 
-    # Axes are opened one by one, yet share the controller's one line of answers and its one busy flag.
-    _controllers: ClassVar[WeakKeyDictionary[Link, _Controller]] = WeakKeyDictionary()
-    _finding: ClassVar[threading.Lock] = threading.Lock()
-
     def __init__(self, link: Link, name: str, axis: int, dialect: Dialect) -> None:
-        self.name = name
-        self.closed = False
+        super().__init__(link, name)
+        self.controller = link.shared(_Controller)
+        self._doubt = self.controller.doubt
         self._axis = axis
-        self._link = link
         self._dialect = dialect
-        with self._finding:
-            self.controller = self._controllers.setdefault(link, _Controller())
-
-    @property
-    def url(self) -> str:
-        """The port, for messages."""
-        return self._link.url
 
     @property
     def lock(self) -> threading.RLock:
         """Held for whole sequences, but never by a stop."""
-        return self.controller.lock
+        return self._doubt.lock
 
     def status(self, attempt: str) -> Status:
         """Ask for the status."""
@@ -511,18 +481,12 @@ class _Wire:
         """Ask for the version, dropping all that comes before: the controller answers in order, so nothing is owed us then."""
         with self.lock:
             found = self._exchange("?:V", find_version, attempt, "a version", repeatable=True)
-            self.controller.in_doubt = False
+            self._doubt.settled()
         return found
 
-    def act(self, command: str, attempt: str, *, veto: Callable[[], DeviceError | None] | None = None) -> None:
+    def act(self, command: str, attempt: str, *, veto: Veto | None = None) -> None:
         """Send a command that changes something, once, and make sure that the controller took it."""
-        with self.lock:
-            self._settle_doubt(attempt)
-            try:
-                taken = self._command(command, attempt, veto=veto)
-            except (TransportTimeout, UnexpectedReply):
-                self.controller.in_doubt = True
-                raise
+        taken = self._doubt.once(lambda: self._command(command, attempt, veto=veto), lambda: self.version(attempt))
         if not taken:
             raise self.fault(f"{command} was refused", attempt, expected="OK", hint="is an axis still moving, or its motor switched off?")
 
@@ -532,18 +496,12 @@ class _Wire:
         try:
             taken = self._command(command, attempt, urgent=True)
         except (TransportTimeout, UnexpectedReply):
-            self.controller.in_doubt = True
+            self._doubt.arises()
             taken = self._command(command, attempt, urgent=True)
         if not taken and self._dialect.answers:
             raise self.fault(f"{command} was refused", attempt, expected="OK", hint="check the controller's command mode")
 
-    def fault(
-        self, problem: str, attempt: str, *, kind: type[DeviceFault] = DeviceFault, expected: str = "", hint: str = ""
-    ) -> DeviceFault:
-        """Make the error for what the controller reports."""
-        return kind(problem, device=self.name, port=self.url, attempt=attempt, expected=expected, hint=hint)
-
-    def _command(self, command: str, attempt: str, *, urgent: bool = False, veto: Callable[[], DeviceError | None] | None = None) -> bool:
+    def _command(self, command: str, attempt: str, *, urgent: bool = False, veto: Veto | None = None) -> bool:
         """Send a command and say whether it was taken."""
         if self._dialect.answers:
             word: Literal["OK", "NG"] = self._exchange(command, _word_or_not_ours, attempt, "OK or NG", urgent=urgent, veto=veto)
@@ -553,20 +511,7 @@ class _Wire:
 
     def _read(self, question: str, accept: Callable[[bytes], T | None], attempt: str, expected: str) -> T:
         """Ask something that may safely be asked twice."""
-        with self.lock:
-            for last in (False, True):
-                self._settle_doubt(attempt)
-                try:
-                    return self._exchange(question, accept, attempt, expected)
-                except (TransportTimeout, UnexpectedReply):
-                    self.controller.in_doubt = True
-                    if last:
-                        raise
-        raise AssertionError("not reached")
-
-    def _settle_doubt(self, attempt: str) -> None:
-        if self.controller.in_doubt:
-            self.version(attempt)
+        return self._doubt.twice(lambda: self._exchange(question, accept, attempt, expected), lambda: self.version(attempt))
 
     def _exchange(
         self,
@@ -577,20 +522,9 @@ class _Wire:
         *,
         repeatable: bool = False,
         urgent: bool = False,
-        veto: Callable[[], DeviceError | None] | None = None,
+        veto: Veto | None = None,
     ) -> T:
-        if self.closed:
-            raise PortClosed("the device was closed", device=self.name, port=self.url, attempt=attempt, hint="open it again")
-        return self._link.exchange(
-            message.encode("ascii") + b"\r\n",
-            accept,
-            attempt=attempt,
-            expected=expected,
-            device=self.name,
-            repeatable=repeatable,
-            urgent=urgent,
-            veto=veto,
-        )
+        return self.exchange(message.encode("ascii") + b"\r\n", accept, attempt, expected, repeatable=repeatable, urgent=urgent, veto=veto)
 
 
 def _status_or_not_ours(line: bytes) -> Status | None:

@@ -12,14 +12,16 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.errors import BadChecksum, DeviceError, DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.endpoint import Endpoint, Veto
+from drivers.errors import BadChecksum, DeviceFault, InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
 from drivers.kinds import AxisState, Identity, MotionProfile
 from drivers.link import Link
+from drivers.motion import Stops, require_arrival
 
 VELOCITY_UNIT = 1 / 1.6384
 """Microsteps per second in one unit of ``maxspeed``."""
@@ -222,8 +224,7 @@ class ZaberAxis:
         self._scale = microsteps_per_degree
         self._acceleration_unit = acceleration_unit
         self._wire = _Wire(link, name, address, axis, checksums)
-        self._stops = 0
-        self._stops_lock = threading.Lock()
+        self._stops = Stops()
 
     @classmethod
     def open(
@@ -401,8 +402,8 @@ class ZaberAxis:
 
         The bytes go out at once, even while other threads wait on the link. An unacknowledged stop is sent once more.
         """
-        with self._stops_lock:
-            self._stops += 1
+        with self._stops.lock:
+            self._stops.count += 1
         self._wire.act("stop", "stopping", urgent=True)
 
     def check_arrival(self, deg: float, tolerance_deg: float) -> None:
@@ -425,15 +426,7 @@ class ZaberAxis:
                 expected="an undisturbed motion",
                 hint="find the cause, then move or home again",
             )
-        if state.moving:
-            raise self._wire.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
-        if not abs(state.position_deg - deg) <= tolerance_deg:
-            raise self._wire.fault(
-                f"rests at {state.position_deg:.4f} deg",
-                attempt,
-                expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
-                hint="was it stopped, or moved by hand?",
-            )
+        require_arrival(self._wire, state, deg, tolerance_deg, attempt)
 
     def close(self) -> None:
         """Let go of the stage without moving it. The link stays open for the others on it."""
@@ -445,27 +438,21 @@ class ZaberAxis:
         reply = self._wire.read(words, attempt)
         count, *flags = reply.data.split()
         if not count.isdecimal() or int(count) != len(flags):
-            raise self._wire.unexpected(reply, attempt, "a count and as many flags")
+            raise self._wire.nonsense(reply, attempt, "a count and as many flags")
         return tuple(flags)
 
     def _start(self, words: str, attempt: str) -> Message:
         """Send a motion command, unless `stop` is called before its bytes are out: a stop must not be followed by an older motion."""
-        stops = self._stops
-
-        def veto() -> DeviceFault | None:
-            return self._wire.fault("stopped before it could start; nothing was sent", attempt) if self._stops != stops else None
-
+        veto = self._stops.veto(self._wire, attempt)
         self._flags("warnings clear")  # they tell of earlier motions; check_arrival is to speak of this one
         return self._wire.ask(words, attempt, veto=veto)
 
 
-class _Wire:
+class _Wire(Endpoint):
     """Questions and answers with one axis."""
 
     def __init__(self, link: Link, name: str, address: int, axis: int, checksums: bool) -> None:
-        self.name = name
-        self.closed = False
-        self._link = link
+        super().__init__(link, name)
         self._address = address
         self._axis = axis
         self._checksums = checksums
@@ -481,11 +468,10 @@ class _Wire:
         axis: int | None = None,
         repeatable: bool = False,
         urgent: bool = False,
-        veto: Callable[[], DeviceError | None] | None = None,
+        veto: Veto | None = None,
     ) -> Message:
         """Send a command and return its reply, rejected or not."""
-        if self.closed:
-            raise PortClosed("the device was closed", device=self.name, port=self._link.url, attempt=attempt, hint="open it again")
+        self.require_open(attempt)  # a closed one uses up no message id
         axis = self._axis if axis is None else axis
         with self._fresh_id() as message_id:
             return self._ask_as(message_id, words, attempt, axis, repeatable=repeatable, urgent=urgent, veto=veto)
@@ -499,7 +485,7 @@ class _Wire:
         *,
         repeatable: bool,
         urgent: bool,
-        veto: Callable[[], DeviceError | None] | None,
+        veto: Veto | None,
     ) -> Message:
         head = b"@%02d %d %02d " % (self._address, axis, message_id)
         damaged: list[BadChecksum | UnexpectedReply] = []
@@ -522,9 +508,7 @@ class _Wire:
         request = encode_command(self._address, axis, message_id, words, with_checksum=self._checksums)
         expected = f"a reply starting {head.decode('ascii')!r}"
         try:
-            return self._link.exchange(
-                request, accept, attempt=attempt, expected=expected, device=self.name, repeatable=repeatable, urgent=urgent, veto=veto
-            )
+            return self.exchange(request, accept, attempt, expected, repeatable=repeatable, urgent=urgent, veto=veto)
         except TransportTimeout as timeout:
             if not damaged:
                 raise
@@ -558,30 +542,17 @@ class _Wire:
         except ValueError:
             number = math.nan
         if not math.isfinite(number):
-            raise self.unexpected(reply, attempt, "one number")
+            raise self.nonsense(reply, attempt, "one number")
         return number
-
-    def fault(
-        self, problem: str, attempt: str, *, kind: type[DeviceFault] = DeviceFault, expected: str = "", hint: str = ""
-    ) -> DeviceFault:
-        """Make the error for what the device reports."""
-        return kind(problem, device=self.name, port=self._link.url, attempt=attempt, expected=expected, hint=hint)
 
     def rejection(self, reply: Message, attempt: str) -> DeviceFault:
         """Make the error for an RJ reply."""
         flag = "" if reply.flag == "--" else f", flag {reply.flag}"
         return self.fault(f"rejected with {reply.data}{flag}", attempt, expected="OK", hint=_REJECT_HINTS.get(reply.data, ""))
 
-    def unexpected(self, reply: Message, attempt: str, expected: str) -> UnexpectedReply:
+    def nonsense(self, reply: Message, attempt: str, expected: str) -> UnexpectedReply:
         """Make the error for data that make no sense."""
-        return UnexpectedReply(
-            f"data {reply.data!r}",
-            device=self.name,
-            port=self._link.url,
-            attempt=attempt,
-            raw=reply.data.encode("ascii"),
-            expected=expected,
-        )
+        return self.unexpected(f"data {reply.data!r}", attempt, expected, raw=reply.data.encode("ascii"))
 
     @contextmanager
     def _fresh_id(self) -> Iterator[int]:

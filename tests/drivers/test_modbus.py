@@ -126,8 +126,8 @@ def test_text() -> None:
         lambda probe: probe.words_of_int32(2**31),
         lambda probe: probe.words_of_float32(1e39),
         lambda probe: probe.int32((1, 2, 3)),
-        lambda probe: ModbusUnit(probe._link, "probe", 0),
-        lambda probe: ModbusUnit(probe._link, "probe", 248),
+        lambda probe: ModbusUnit(probe.link, "probe", 0),
+        lambda probe: ModbusUnit(probe.link, "probe", 248),
     ],
 )
 def test_what_cannot_be_asked_is_not_sent(unit: Plug, ask: Callable[[ModbusUnit], object]) -> None:
@@ -232,7 +232,7 @@ def test_a_closed_device_and_a_closed_link(unit: Plug) -> None:
     with pytest.raises(PortClosed, match="open it again"):
         probe.echo()
     other = unit()
-    other._link.close()
+    other.link.close()
     with pytest.raises(PortClosed):
         other.echo()
 
