@@ -35,15 +35,14 @@ class Doubt:
         """Nothing is owed any more."""
         self._exists = False
 
-    def settle(self, resynchronise: Callable[[], object]) -> None:
-        """Resynchronise where there is doubt."""
+    def _settle(self, resynchronise: Callable[[], object]) -> None:
         if self._exists:
             resynchronise()
 
     def once(self, ask: Callable[[], T], resynchronise: Callable[[], object]) -> T:
         """Ask once: what changes something."""
         with self.lock:
-            self.settle(resynchronise)
+            self._settle(resynchronise)
             try:
                 return ask()
             except (TransportTimeout, UnexpectedReply):
@@ -53,7 +52,7 @@ class Doubt:
     def twice(self, ask: Callable[[], T], resynchronise: Callable[[], object]) -> T:
         """Ask something that may safely be asked twice, again where the answer was missing or malformed."""
         with self.lock:
-            self.settle(resynchronise)
+            self._settle(resynchronise)
             try:
                 return ask()
             except (TransportTimeout, UnexpectedReply):

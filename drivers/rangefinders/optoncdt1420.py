@@ -21,7 +21,8 @@ from dataclasses import dataclass
 from statistics import median_low
 from typing import Any, TypeVar
 
-from drivers.errors import DeviceFault, InvalidSetting, PortClosed, UnexpectedReply
+from drivers.endpoint import Endpoint
+from drivers.errors import DeviceFault, InvalidSetting, UnexpectedReply
 from drivers.kinds import DistanceReading, Identity
 from drivers.link import Link
 
@@ -174,12 +175,10 @@ class OptoNCDT1420:
         for what, given_mm in (("spread_mm", spread_mm), ("measuring_range_mm", measuring_range_mm)):
             if given_mm is not None and not 0 < given_mm < math.inf:
                 raise InvalidSetting(f"{what} {given_mm}", device=name, expected="a finite length above 0")
-        self._link = link
-        self._name = name
+        self._end = Endpoint(link, name)
         self._values, self._spread_mm, self._start_mm, self._last_valid = values, spread_mm, start_of_range_mm, last_valid
         self._range_mm = measuring_range_mm
         self._lock = threading.RLock()
-        self._closed = False
 
     @classmethod
     def open(
@@ -229,7 +228,7 @@ class OptoNCDT1420:
     @property
     def name(self) -> str:
         """What the user calls it."""
-        return self._name
+        return self._end.name
 
     def identify(self) -> Identity:
         """Ask GETINFO."""
@@ -239,7 +238,7 @@ class OptoNCDT1420:
     def limits_mm(self) -> tuple[float, float]:
         """Start and end of the measuring range, mm."""
         if self._range_mm is None:
-            raise InvalidSetting("the measuring range is not known", device=self._name, hint="give measuring_range_mm, or use open()")
+            raise InvalidSetting("the measuring range is not known", device=self._end.name, hint="give measuring_range_mm, or use open()")
         return self._start_mm, self._start_mm + self._range_mm
 
     def read(self) -> DistanceReading:
@@ -275,7 +274,7 @@ class OptoNCDT1420:
 
     def close(self) -> None:
         """Let go of the sensor. The link stays open."""
-        self._closed = True
+        self._end.closed = True
 
     def _reading(self, words: list[int]) -> DistanceReading:
         errors = [word for word in words if word > LAST_VALUE]
@@ -297,12 +296,10 @@ class OptoNCDT1420:
         given_mm = self._range_mm
         other = given_mm is not None and told_mm is not None and not math.isclose(given_mm, told_mm)
         if other or not (given_mm or told_mm):
-            raise UnexpectedReply(
+            raise self._end.unexpected(
                 f"measuring range {text!r}",
-                device=self._name,
-                port=self._link.url,
-                attempt="asking for the measuring range",
-                expected="a length in mm" if given_mm is None else f"{given_mm:g} mm",
+                "asking for the measuring range",
+                "a length in mm" if given_mm is None else f"{given_mm:g} mm",
                 hint="give measuring_range_mm as printed on the sensor",
             )
         self._range_mm = given_mm or told_mm
@@ -324,10 +321,8 @@ class OptoNCDT1420:
             self._exchange(command, lambda frame: _answers(command, frame), f"sending {command}", f"{command}, then ->")
 
     def _exchange(self, command: str, accept: Callable[[bytes], T | None], attempt: str, expected: str) -> T:
-        if self._closed:
-            raise PortClosed("the device was closed", device=self._name, port=self._link.url, attempt=attempt, hint="open it again")
         request = command.encode("ascii") + b"\r\n"
-        return self._link.exchange(request, accept, attempt=attempt, expected=expected, device=self._name, repeatable=True)
+        return self._end.exchange(request, accept, attempt, expected, repeatable=True)
 
 
 def _is_value(frame: bytes) -> bool:

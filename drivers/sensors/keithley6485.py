@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import TypeVar
 
-from drivers.errors import DeviceFault, InvalidSetting, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.doubt import Doubt
+from drivers.endpoint import Endpoint
+from drivers.errors import DeviceFault, InvalidSetting, UnexpectedReply
 from drivers.kinds import Identity, LightReading
 from drivers.link import Link
 
@@ -144,13 +145,10 @@ class Keithley6485:
     def __init__(self, link: Link, name: str, *, line_frequency_hz: int = 50, status_bits: StatusBits | None = None) -> None:
         if line_frequency_hz not in (50, 60):
             raise InvalidSetting(f"line_frequency_hz {line_frequency_hz}", device=name, expected="50 or 60")
-        self._link = link
-        self._name = name
+        self._end = Endpoint(link, name)
         self._line_frequency_hz = line_frequency_hz
         self._bits = StatusBits() if status_bits is None else status_bits
-        self._lock = threading.RLock()
-        self._in_doubt = True  # whether an unclaimed reply may still be on its way
-        self._closed = False
+        self._doubt = Doubt()
         self._integration_s = _RESET_INTEGRATION_S
         self._range_a: float | None = None
 
@@ -183,7 +181,7 @@ class Keithley6485:
     @property
     def name(self) -> str:
         """What the user calls it."""
-        return self._name
+        return self._end.name
 
     @property
     def unit(self) -> str:
@@ -202,7 +200,7 @@ class Keithley6485:
 
     def identify(self) -> Identity:
         """Ask ``*IDN?``. Any other reply still on its way is dropped."""
-        with self._lock:
+        with self._doubt.lock:
             return self._resynchronise("asking for the identity")
 
     def configure(self, integration_s: float, range: float | None = None) -> None:
@@ -223,7 +221,7 @@ class Keithley6485:
             The meter refuses.
         """
         cycles, full_scale = self._plan(integration_s, range)
-        with self._lock:
+        with self._doubt.lock:
             self._command(f"SENS:CURR:NPLC {cycles:.2f}")
             self._integration_s = cycles / self._line_frequency_hz
             if full_scale is None:
@@ -243,17 +241,14 @@ class Keithley6485:
         DeviceFault
             The meter says not-a-number, or its zero check is on.
         """
-        with self._lock:
-            attempt, expected = "taking a reading", "READ,UNIT,TIME,STAT"
-            self._settle_doubt(attempt)
-            try:
-                return self._ask(b"READ?", self._parse_reading, attempt, expected)
-            except (TransportTimeout, UnexpectedReply):
-                return self._ask(b"READ?", self._parse_reading, attempt, expected)
+        attempt, expected = "taking a reading", "READ,UNIT,TIME,STAT"
+        return self._doubt.twice(
+            lambda: self._exchange(b"READ?", self._parse_reading, attempt, expected), lambda: self._resynchronise(attempt)
+        )
 
     def close(self) -> None:
         """Let go of the meter. The link stays open."""
-        self._closed = True
+        self._end.closed = True
 
     def _parse_reading(self, line: bytes) -> LightReading:
         return parse_reading(line, self._bits)
@@ -264,7 +259,7 @@ class Keithley6485:
         if not 0.01 <= cycles <= most:
             raise InvalidSetting(
                 f"integration_s {integration_s}",
-                device=self._name,
+                device=self._end.name,
                 expected=f"{0.01 / self._line_frequency_hz:.2g} to 1 s",
                 hint="average several readings",
             )
@@ -274,7 +269,7 @@ class Keithley6485:
         full_scale = next((scale for scale in RANGES_A if 0 < range_a <= scale * (1 + 1e-9)), None)
         if full_scale is None:
             raise InvalidSetting(
-                f"range {range_a}", device=self._name, expected=f"above 0 and at most {RANGES_A[-1]:g} A, or none for automatic"
+                f"range {range_a}", device=self._end.name, expected=f"above 0 and at most {RANGES_A[-1]:g} A, or none for automatic"
             )
         return cycles, full_scale
 
@@ -296,16 +291,9 @@ class Keithley6485:
     def _command(self, command: str) -> None:
         """Send a command that has no reply, and make sure that the meter took it."""
         attempt = f"sending {command}"
-        code, text = self._ask(command.encode("ascii") + self._link.terminator + b"SYST:ERR?", _parse_error, attempt, _NO_ERROR)
+        code, text = self._ask(command.encode("ascii") + self._end.link.terminator + b"SYST:ERR?", _parse_error, attempt, _NO_ERROR)
         if code:
-            raise DeviceFault(
-                f"error {code}, {text}",
-                device=self._name,
-                port=self._link.url,
-                attempt=attempt,
-                expected=_NO_ERROR,
-                hint="check model and firmware",
-            )
+            raise self._end.fault(f"error {code}, {text}", attempt, expected=_NO_ERROR, hint="check model and firmware")
 
     def _empty_error_queue(self) -> None:
         """Drop what earlier users left, so that the next error is ours."""
@@ -314,21 +302,11 @@ class Keithley6485:
             code, text = self._ask(b"SYST:ERR?", _parse_error, attempt, _NO_ERROR)
             if not code:
                 return
-        raise DeviceFault(f"the queue never ends, last error {code}, {text}", device=self._name, port=self._link.url, attempt=attempt)
+        raise self._end.fault(f"the queue never ends, last error {code}, {text}", attempt)
 
     def _ask(self, question: bytes, parse: Callable[[bytes], T], attempt: str, expected: str) -> T:
         """Ask once. When the reply is missing or malformed, the next question is preceded by a resynchronisation."""
-        with self._lock:
-            self._settle_doubt(attempt)
-            try:
-                return self._exchange(question, parse, attempt, expected)
-            except (TransportTimeout, UnexpectedReply):
-                self._in_doubt = True
-                raise
-
-    def _settle_doubt(self, attempt: str) -> None:
-        if self._in_doubt:
-            self._resynchronise(attempt)
+        return self._doubt.once(lambda: self._exchange(question, parse, attempt, expected), lambda: self._resynchronise(attempt))
 
     def _resynchronise(self, attempt: str) -> Identity:
         """Ask for the name and drop all that comes before it: the meter answers in order, so nothing is owed to us afterwards."""
@@ -337,28 +315,19 @@ class Keithley6485:
             return parse_identity(line) if line.lstrip().startswith(b"KEITHLEY") else None
 
         identity = self._exchange(b"*IDN?", skip_to_name, attempt, "KEITHLEY INSTRUMENTS INC.,MODEL 6485,...", repeatable=True)
-        self._in_doubt = False
+        self._doubt.settled()
         return identity
 
     def _exchange(
         self, question: bytes, accept: Callable[[bytes], T | None], attempt: str, expected: str, *, repeatable: bool = False
     ) -> T:
-        if self._closed:
-            raise PortClosed("the device was closed", device=self._name, port=self._link.url, attempt=attempt, hint="open it again")
-        return self._link.exchange(
-            question + self._link.terminator,
-            accept,
-            attempt=attempt,
-            expected=expected,
-            device=self._name,
-            timeout_s=self._allowance_s(),
-            repeatable=repeatable,
-        )
+        message = question + self._end.link.terminator
+        return self._end.exchange(message, accept, attempt, expected, timeout_s=self._allowance_s(), repeatable=repeatable)
 
     def _allowance_s(self) -> float:
         """Time for a reply: the link's own, and a reading on every range the meter may try, for commands queue behind readings."""
         ranges = len(RANGES_A) if self._range_a is None else 1
-        return self._link.timeout_s + self._integration_s * _CONVERSIONS_PER_READING * ranges
+        return self._end.link.timeout_s + self._integration_s * _CONVERSIONS_PER_READING * ranges
 
 
 def _parse_error(line: bytes) -> tuple[int, str]:

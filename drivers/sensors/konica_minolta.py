@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from collections.abc import Callable
 from typing import Literal, TypeVar
 
-from drivers.errors import DeviceFault, InvalidSetting, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.doubt import Doubt
+from drivers.endpoint import Endpoint
+from drivers.errors import DeviceFault, InvalidSetting, TransportTimeout, UnexpectedReply
 from drivers.kinds import Identity, LightReading
 from drivers.link import Link
 
@@ -137,16 +138,13 @@ class LuminanceMeter:
         if not 0 < fast_s < slow_s < math.inf or not 0 <= measuring_s < math.inf:
             given = f"fast_s {fast_s}, slow_s {slow_s}, measuring_s {measuring_s}"
             raise InvalidSetting(given, device=name, expected="finite times, slow_s longer than fast_s and that above 0")
-        self._link = link
-        self._name = name
+        self._end = Endpoint(link, name)
         self._identity = Identity("Konica Minolta", model, serial_number, "not told")
         self._model = model
         self._fast_s, self._slow_s, self._measuring_s = fast_s, slow_s, measuring_s
         self._chroma_over_is_good = chroma_over_is_good
         self._integration_s = slow_s
-        self._lock = threading.RLock()
-        self._in_doubt = True  # whether an unclaimed reply may still be on its way
-        self._closed = False
+        self._doubt = Doubt()
 
     @classmethod
     def open(
@@ -193,7 +191,7 @@ class LuminanceMeter:
     @property
     def name(self) -> str:
         """What the user calls it."""
-        return self._name
+        return self._end.name
 
     @property
     def unit(self) -> str:
@@ -207,7 +205,7 @@ class LuminanceMeter:
 
     def identify(self) -> Identity:
         """Make sure that the meter answers; who it is, it cannot say, so this is what the constructor was told."""
-        with self._lock:
+        with self._doubt.lock:
             self._resynchronise("looking for the meter")
             return self._identity
 
@@ -229,7 +227,7 @@ class LuminanceMeter:
             The meter refuses.
         """
         mode, seconds = self._response(integration_s, range)
-        with self._lock:
+        with self._doubt.lock:
             self._set(mode)
             self._integration_s = seconds
 
@@ -243,29 +241,6 @@ class LuminanceMeter:
         DeviceFault
             The meter reports an error.
         """
-        with self._lock:
-            try:
-                return self._measure()
-            except (TransportTimeout, UnexpectedReply):
-                return self._measure()
-
-    def close(self) -> None:
-        """Let go of the meter. The link stays open."""
-        self._closed = True
-
-    def _response(self, integration_s: float, range: float | None) -> tuple[str, float]:
-        if range is not None:
-            raise InvalidSetting(f"range {range}", device=self._name, expected="none: the meter chooses its range itself")
-        if not 0 < integration_s <= self._slow_s:
-            raise InvalidSetting(
-                f"integration_s {integration_s}",
-                device=self._name,
-                expected=f"above 0 and at most {self._slow_s:g} s",
-                hint="average several readings",
-            )
-        return (_FAST, self._fast_s) if integration_s <= self._fast_s else (_SLOW, self._slow_s)
-
-    def _measure(self) -> LightReading:
         attempt = "measuring"
 
         def accept(line: bytes) -> LightReading | None:
@@ -273,40 +248,42 @@ class LuminanceMeter:
                 return None
             return parse_reading(line, self._model, chroma_over_is_good=self._chroma_over_is_good)
 
-        return self._ask("MES", accept, attempt, "OK00 and the reading")
+        return self._doubt.twice(
+            lambda: self._exchange("MES", accept, attempt, "OK00 and the reading"), lambda: self._resynchronise(attempt)
+        )
+
+    def close(self) -> None:
+        """Let go of the meter. The link stays open."""
+        self._end.closed = True
+
+    def _response(self, integration_s: float, range: float | None) -> tuple[str, float]:
+        if range is not None:
+            raise InvalidSetting(f"range {range}", device=self._end.name, expected="none: the meter chooses its range itself")
+        if not 0 < integration_s <= self._slow_s:
+            raise InvalidSetting(
+                f"integration_s {integration_s}",
+                device=self._end.name,
+                expected=f"above 0 and at most {self._slow_s:g} s",
+                hint="average several readings",
+            )
+        return (_FAST, self._fast_s) if integration_s <= self._fast_s else (_SLOW, self._slow_s)
 
     def _set(self, mode: str) -> None:
         self._ask(f"MDS,{mode}", _accept_setting, f"setting mode {mode}", "OK00")
 
     def _ask(self, command: str, accept: Callable[[bytes], T | None], attempt: str, expected: str) -> T:
         """Ask once. When the reply is missing or malformed, the next question is preceded by a resynchronisation."""
-        with self._lock:
-            if self._in_doubt:
-                self._resynchronise(attempt)
-            try:
-                return self._exchange(command, accept, attempt, expected)
-            except (TransportTimeout, UnexpectedReply):
-                self._in_doubt = True
-                raise
+        return self._doubt.once(lambda: self._exchange(command, accept, attempt, expected), lambda: self._resynchronise(attempt))
 
     def _resynchronise(self, attempt: str) -> None:
         """Set absolute readings, as they always are, and drop what comes before the answer: the meter answers in order."""
         self._exchange(f"MDS,{_ABSOLUTE}", _accept_setting, attempt, "OK00", repeatable=True)
-        self._in_doubt = False
+        self._doubt.settled()
 
     def _exchange(self, command: str, accept: Callable[[bytes], T | None], attempt: str, expected: str, *, repeatable: bool = False) -> T:
-        if self._closed:
-            raise PortClosed("the device was closed", device=self._name, port=self._link.url, attempt=attempt, hint="open it again")
-        try:
-            return self._link.exchange(
-                command.encode("ascii") + b"\r\n",
-                accept,
-                attempt=attempt,
-                expected=expected,
-                device=self._name,
-                timeout_s=self._link.timeout_s + self._measuring_s,  # settings queue behind a measurement
-                repeatable=repeatable,
-            )
+        message, allowed_s = command.encode("ascii") + b"\r\n", self._end.link.timeout_s + self._measuring_s
+        try:  # settings queue behind a measurement
+            return self._end.exchange(message, accept, attempt, expected, timeout_s=allowed_s, repeatable=repeatable)
         except TransportTimeout as error:
             error.hint = "switch the meter on with its F key held, and check cable and line settings"
             raise

@@ -1,4 +1,4 @@
-"""Modbus frames and a port made of them, without a wire."""
+"""Modbus frames, a port made of them without a wire, and time that passes only when waited for."""
 
 from __future__ import annotations
 
@@ -51,3 +51,24 @@ class Canned:
 def link_to(answer: Callable[[bytes], bytes]) -> ModbusLink:
     """A link without patience to an other end that has the answers ready."""
     return ModbusLink(Canned(answer), url="canned://", timeout_s=1e-9)
+
+
+class Hurried:
+    """Time that passes only when somebody waits, and then a lot.
+
+    Parameters
+    ----------
+    pace : float
+        How many times what is waited for.
+    """
+
+    def __init__(self, pace: float) -> None:
+        self._pace, self._now = pace, 0.0
+
+    def monotonic(self) -> float:
+        """Seconds since it was made."""
+        return self._now
+
+    def sleep(self, seconds: float, /) -> None:
+        """Let time pass."""
+        self._now += self._pace * seconds

@@ -15,7 +15,7 @@ from drivers.errors import BadChecksum, DeviceError, DeviceFault, InvalidSetting
 from drivers.kinds import LightSensor
 from drivers.modbus import ModbusLink, ModbusRefusal
 from drivers.sensors.apogee import SQ422X, judge
-from tests.drivers.rtu import framed, link_to
+from tests.drivers.rtu import Hurried, framed, link_to
 
 SHORT_S = 0.2
 READ_OUTPUT = bytes.fromhex("01 03 00 00 00 02 C4 0B")  # from the sheet
@@ -77,21 +77,8 @@ def test_it_waits_while_the_sensor_is_busy(sensor: Any) -> None:
     assert sensor(STATUS, BUSY, STATUS, BUSY, STATUS, READY, READ_OUTPUT, FLUX).read().good
 
 
-class Hurried:
-    """Time that passes only when somebody waits, and then a lot."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float, /) -> None:
-        self.now += 10 * seconds
-
-
 def test_it_does_not_wait_for_ever(sensor: Any) -> None:
-    lamp = sensor(*[STATUS, BUSY] * 3, busy_s=0.4, clock=Hurried())
+    lamp = sensor(*[STATUS, BUSY] * 3, busy_s=0.4, clock=Hurried(10))
     with pytest.raises(DeviceFault, match=r"lamp on /dev/.*busy for 0.4 s"):
         lamp.read()
 

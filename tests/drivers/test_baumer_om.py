@@ -15,7 +15,7 @@ from drivers.errors import DeviceError, DeviceFault, InvalidSetting, PortClosed,
 from drivers.kinds import RangeFinder
 from drivers.modbus import ModbusLink, ModbusRefusal
 from drivers.rangefinders.baumer_om import BaumerOM, judge
-from tests.drivers.rtu import framed, link_to
+from tests.drivers.rtu import Hurried, framed, link_to
 
 MEASURE = "01 04 00 C8 00 0D"  # 200, 13 registers
 
@@ -84,22 +84,9 @@ def test_an_old_measurement_is_not_told(link: Any) -> None:
     assert BaumerOM(link(*[ASK, block(8)] * 3, ASK, later), "range").read().distance_mm == 75.0
 
 
-class Hurried:
-    """Time that passes only when somebody waits, and then a lot."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def sleep(self, seconds: float, /) -> None:
-        self.now += 250 * seconds
-
-
 def test_no_new_measurement_is_a_fault(link: Any) -> None:
     with pytest.raises(DeviceFault, match=r"range on /dev/.*no new measurement within 1 s.*laser"):
-        BaumerOM(link(*[ASK, block(8)] * 4), "range", clock=Hurried()).read()
+        BaumerOM(link(*[ASK, block(8)] * 4), "range", clock=Hurried(250)).read()
 
 
 @pytest.mark.parametrize("distance", ["0000 7FC0", "0001 7F80", "0000 FFC0"])
