@@ -1,12 +1,15 @@
-"""What a rotary axis, a light sensor and a range finder can do, whoever made them, and the values they hand over."""
+"""What a stage, a light sensor and a range finder can do, whoever made them, and the values they hand over."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from drivers.errors import InvalidSetting
+
+Unit = Literal["deg", "mm"]
+"""What a stage counts in."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +28,8 @@ class AxisState:
 
     Attributes
     ----------
-    position_deg : float, deg
-        Readback.
+    position : float
+        Readback, in the stage's unit.
     moving : bool
         Whether the axis is busy.
     homed : bool
@@ -35,7 +38,7 @@ class AxisState:
         Warning flags in the device's own spelling, all that are set.
     """
 
-    position_deg: float
+    position: float
     moving: bool
     homed: bool
     warnings: tuple[str, ...] = ()
@@ -47,9 +50,10 @@ class MotionProfile:
 
     Attributes
     ----------
-    speed_deg_s : float, deg/s
-    acceleration_deg_s2 : float, deg/s^2
-        Of the ramp up and of the ramp down.
+    speed : float
+        The stage's unit per second.
+    acceleration : float
+        Unit/s^2, of the ramp up and of the ramp down.
 
     Raises
     ------
@@ -57,24 +61,24 @@ class MotionProfile:
         If either is not finite and above 0.
     """
 
-    speed_deg_s: float
-    acceleration_deg_s2: float
+    speed: float
+    acceleration: float
 
     def __post_init__(self) -> None:
-        for what, value in (("speed", self.speed_deg_s), ("acceleration", self.acceleration_deg_s2)):
+        for what, value in (("speed", self.speed), ("acceleration", self.acceleration)):
             if not (math.isfinite(value) and value > 0):
                 raise InvalidSetting(f"{what} {value}", expected="a finite number above 0")
 
-    def duration_s(self, distance_deg: float) -> float:
-        """Time to travel a distance (deg, either sign) from rest to rest, in s.
+    def duration_s(self, distance: float) -> float:
+        """Time to travel a distance (either sign) from rest to rest, in s.
 
         A trapezoid of velocity, or a triangle when the distance is too short to reach full speed.
         """
-        distance = abs(distance_deg)
-        ramps = self.speed_deg_s**2 / self.acceleration_deg_s2  # travelled in the two ramps together
+        distance = abs(distance)
+        ramps = self.speed**2 / self.acceleration  # travelled in the two ramps together
         if distance >= ramps:
-            return distance / self.speed_deg_s + self.speed_deg_s / self.acceleration_deg_s2
-        return 2 * math.sqrt(distance / self.acceleration_deg_s2)
+            return distance / self.speed + self.speed / self.acceleration
+        return 2 * math.sqrt(distance / self.acceleration)
 
 
 @dataclass(frozen=True)
@@ -165,12 +169,20 @@ class DistanceReading:
 
 
 @runtime_checkable
-class RotaryAxis(Protocol):
-    """A motorised rotation. Calls block for one exchange, not for a motion; any thread may call."""
+class Stage(Protocol):
+    """A motorised rotation or slide. Calls block for one exchange, not for a motion; any thread may call.
+
+    Positions are in `unit`, speeds in unit/s, accelerations in unit/s^2.
+    """
 
     @property
     def name(self) -> str:
         """What the user calls it."""
+        ...
+
+    @property
+    def unit(self) -> Unit:
+        """Degrees or millimetres."""
         ...
 
     def identify(self) -> Identity:
@@ -181,31 +193,31 @@ class RotaryAxis(Protocol):
         """Ask where the axis is and what it is doing."""
         ...
 
-    def limits_deg(self) -> tuple[float, float]:
-        """The device's own lower and upper limit, deg."""
+    def limits(self) -> tuple[float, float]:
+        """The device's own lower and upper limit."""
         ...
 
     def profile(self) -> MotionProfile:
         """Read speed and acceleration from the device."""
         ...
 
-    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
-        """Set speed (deg/s), acceleration (deg/s^2) or both in the device."""
+    def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
+        """Set speed, acceleration or both in the device."""
         ...
 
     def start_home(self) -> None:
         """Start the search for the reference position and return at once."""
         ...
 
-    def start_move(self, deg: float) -> None:
-        """Start moving to an angle (deg) and return at once.
+    def start_move(self, position: float, /) -> None:
+        """Start moving to a position and return at once.
 
         Raises
         ------
         NotHomed
             The axis has no reference position.
         DeviceFault
-            The device refuses, for instance because the angle is beyond its limits.
+            The device refuses, for instance because the position is beyond its limits.
         """
         ...
 
@@ -213,8 +225,8 @@ class RotaryAxis(Protocol):
         """Stop the axis now: the bytes go out even while another thread waits on the link. Stopping twice is harmless."""
         ...
 
-    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
-        """Make sure that the axis rests at an angle (deg) because it got there.
+    def check_arrival(self, position: float, tolerance: float, /) -> None:
+        """Make sure that the axis rests at a position because it got there.
 
         Raises
         ------
@@ -225,6 +237,15 @@ class RotaryAxis(Protocol):
 
     def close(self) -> None:
         """Let go of the device. The link stays open for the others on it."""
+        ...
+
+
+@runtime_checkable
+class ForgetfulStage(Stage, Protocol):
+    """A stage whose controller does not tell whether it was homed: the driver knows only of what it has seen itself."""
+
+    def trust_reference(self) -> None:
+        """Take the axis as homed: somebody else saw it homed, and nothing has moved it since."""
         ...
 
 

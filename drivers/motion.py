@@ -8,7 +8,7 @@ from typing import Protocol
 
 from drivers.endpoint import Endpoint, Veto
 from drivers.errors import DeviceError, MoveTimeout
-from drivers.kinds import AxisState, RotaryAxis
+from drivers.kinds import AxisState, Stage, Unit
 
 POLL_S = 0.005
 
@@ -48,23 +48,23 @@ class Stops:
         return veto
 
 
-def require_arrival(endpoint: Endpoint, state: AxisState, deg: float, tolerance_deg: float, attempt: str) -> None:
-    """Raise DeviceFault unless an axis rests, and within `tolerance_deg` of an angle (deg)."""
+def require_arrival(endpoint: Endpoint, state: AxisState, position: float, tolerance: float, attempt: str, *, unit: Unit = "deg") -> None:
+    """Raise DeviceFault unless an axis rests, and within `tolerance` of a position."""
     if state.moving:
-        raise endpoint.fault(f"still moving at {state.position_deg:.4f} deg", attempt, expected="rest")
-    if not abs(state.position_deg - deg) <= tolerance_deg:
+        raise endpoint.fault(f"still moving at {state.position:.4f} {unit}", attempt, expected="rest")
+    if not abs(state.position - position) <= tolerance:
         raise endpoint.fault(
-            f"rests at {state.position_deg:.4f} deg",
+            f"rests at {state.position:.4f} {unit}",
             attempt,
-            expected=f"{deg:.4f} +- {tolerance_deg:g} deg",
+            expected=f"{position:.4f} +- {tolerance:g} {unit}",
             hint="was it stopped, or moved by hand?",
         )
 
 
-def wait_until_idle(axis: RotaryAxis, expected_s: float, *, timeout_s: float, clock: Clock = time) -> AxisState:
+def wait_until_idle(axis: Stage, expected_s: float, *, timeout_s: float, clock: Clock = time) -> AxisState:
     """Wait for a motion that has just been started: sleep until it should be over, then ask every 5 ms.
 
-    That the axis is idle does not mean that it arrived: see `RotaryAxis.check_arrival`.
+    That the axis is idle does not mean that it arrived: see `Stage.check_arrival`.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def wait_until_idle(axis: RotaryAxis, expected_s: float, *, timeout_s: float, cl
             elapsed_s = clock.monotonic() - started
             if elapsed_s >= timeout_s:
                 raise MoveTimeout(
-                    f"still moving at {state.position_deg:.4f} deg; it has been told to stop",
+                    f"still moving at {state.position:.4f} {axis.unit}; it has been told to stop",
                     device=axis.name,
                     attempt="waiting for the end of the motion",
                     expected=f"rest after {expected_s:.3f} s",
@@ -108,7 +108,7 @@ def wait_until_idle(axis: RotaryAxis, expected_s: float, *, timeout_s: float, cl
         raise
 
 
-def _stop_after(error: BaseException, axis: RotaryAxis) -> None:
+def _stop_after(error: BaseException, axis: Stage) -> None:
     try:
         axis.stop()
     except DeviceError as second:

@@ -7,7 +7,7 @@ from typing import Any
 
 from drivers import catalogue
 from drivers.errors import DeviceError
-from drivers.kinds import LightSensor, RotaryAxis
+from drivers.kinds import LightSensor, Stage
 from drivers.link import Link
 from rig.bus import BusWorker
 from rig.clock import Clock
@@ -101,14 +101,14 @@ def open_bench(config: BenchConfig, specimen: str) -> Iterator[Bench]:
         for name, axis in config.axes.items():
             link, worker = stage_links[name]
             stage = models.lookup(axis.model).open_device(link, name=name, **axis.options)
-            if not isinstance(stage, RotaryAxis):
+            if not isinstance(stage, Stage):
                 raise ConfigError(f"{config.source}: axes.{name}.model: {axis.model} is not a rotary axis")
-            stage.set_profile(speed_deg_s=axis.speed_deg_s, acceleration_deg_s2=axis.acceleration_deg_s2)
+            stage.set_profile(speed=axis.speed, acceleration=axis.acceleration)
             axes[name] = _axis(axis, stage, bench, worker)
         yield bench
 
 
-def _axis(config: AxisConfig, stage: RotaryAxis, bench: Bench, worker: BusWorker) -> Axis:
+def _axis(config: AxisConfig, stage: Stage, bench: Bench, worker: BusWorker) -> Axis:
     interlock: Interlock = bench.config.interlock
 
     def check(axis: str, target_deg: float) -> None:
@@ -122,6 +122,6 @@ def _axis(config: AxisConfig, stage: RotaryAxis, bench: Bench, worker: BusWorker
         worker,
         bench.clock,
         settle_s=config.settle_s,
-        tolerance_deg=config.tolerance_deg,
+        tolerance=config.tolerance,
         check=check,
     )

@@ -27,11 +27,11 @@ class AxisConfig:
     model: str
     port: str
     map: AxisMap
-    limits_deg: tuple[float, float]
-    speed_deg_s: float | None
-    acceleration_deg_s2: float | None
+    limits: tuple[float, float]
+    speed: float | None
+    acceleration: float | None
     settle_s: float
-    tolerance_deg: float
+    tolerance: float
     options: Mapping[str, Any]
     serial: Mapping[str, Any]
 
@@ -76,7 +76,7 @@ class BenchConfig:
     @property
     def interlock(self) -> Interlock:
         """Limits and keep-out."""
-        return Interlock({name: axis.limits_deg for name, axis in self.axes.items()}, self.keep_out)
+        return Interlock({name: axis.limits for name, axis in self.axes.items()}, self.keep_out)
 
     @property
     def sha256(self) -> str:
@@ -143,7 +143,7 @@ def parse_config(text: str, source: str) -> BenchConfig:
 
 
 def _axis(name: str, table: "_Table") -> AxisConfig:
-    model, options, serial = _device(table, "rotary-axis", frozenset({"speed_deg_s", "acceleration_deg_s2"}))
+    model, options, serial = _device(table, "rotary-axis", frozenset({"speed", "acceleration"}))
     low, high = table.pair("limits")
     if low >= high:
         raise table.error("limits", f"[{low:g}, {high:g}] are swapped: give [lowest, highest] in degrees")
@@ -155,11 +155,11 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
         model=model,
         port=table.text("port"),
         map=AxisMap(int(sign), table.number("offset", default=0.0)),
-        limits_deg=(low, high),
-        speed_deg_s=table.positive("speed", default=None),
-        acceleration_deg_s2=table.positive("acceleration", default=None),
+        limits=(low, high),
+        speed=table.positive("speed", default=None),
+        acceleration=table.positive("acceleration", default=None),
         settle_s=table.number("settle", default=0.1, low=0.0),
-        tolerance_deg=table.positive("tolerance", default=0.02) or 0.02,
+        tolerance=table.positive("tolerance", default=0.02) or 0.02,
         options=options,
         serial=serial,
     )

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from drivers.errors import DeviceFault, MoveTimeout, NotHomed, UnexpectedReply
-from drivers.kinds import LightReading, LightSensor, RotaryAxis
+from drivers.kinds import LightReading, LightSensor, Stage
 from rig.bus import BusWorker, Task
 from rig.clock import Clock
 from rig.errors import InterlockError
@@ -66,14 +66,14 @@ class Axis(Configured):
         The axis, e.g. `detector`.
     angle : str
         The angle it realises, e.g. `theta_r`; its readback carries this name in every event.
-    driver : RotaryAxis
+    driver : Stage
     axis_map : AxisMap
     bus : BusWorker
         The worker of the port the stage hangs on.
     clock : Clock
     settle_s : float
         How long the arm rings after the stage has arrived.
-    tolerance_deg : float
+    tolerance : float
         How far from its target a stage that has arrived may stand.
     check : callable
         `check(axis name, theta_deg)` raises InterlockError where the axis may not go.
@@ -85,13 +85,13 @@ class Axis(Configured):
         self,
         name: str,
         angle: str,
-        driver: RotaryAxis,
+        driver: Stage,
         axis_map: AxisMap,
         bus: BusWorker,
         clock: Clock,
         *,
         settle_s: float,
-        tolerance_deg: float,
+        tolerance: float,
         check: Callable[[str, float], None],
     ) -> None:
         self.name = name
@@ -99,7 +99,7 @@ class Axis(Configured):
         self.driver = driver
         self.map = axis_map
         self.settle_s = settle_s
-        self.tolerance_deg = tolerance_deg
+        self.tolerance = tolerance
         self.homing = Homing(self)
         self._bus = bus
         self._clock = clock
@@ -134,7 +134,7 @@ class Axis(Configured):
         """Ask the stage where it stands."""
         state = self.driver.state()
         self._homed = state.homed
-        self._readback = self.map.to_theta(state.position_deg)
+        self._readback = self.map.to_theta(state.position)
 
     def travel_s(self, from_deg: float, to_deg: float) -> float:
         """Return the bench seconds a move takes, settling included."""
@@ -197,10 +197,10 @@ class Axis(Configured):
             **vars(self._identity),
             "sign": self.map.sign,
             "offset_deg": self.map.offset_deg,
-            "speed_deg_s": self._profile.speed_deg_s,
-            "acceleration_deg_s2": self._profile.acceleration_deg_s2,
+            "speed": self._profile.speed,
+            "acceleration": self._profile.acceleration,
             "settle_s": self.settle_s,
-            "tolerance_deg": self.tolerance_deg,
+            "tolerance": self.tolerance,
         }
 
     # -- motion --------------------------------------------------------------------------------------------------------
@@ -215,15 +215,15 @@ class Axis(Configured):
     def _move(self, target: float, stopped: threading.Event) -> Task:
         axis_deg = self.map.to_axis(target)
         state = self.driver.state()
-        self._readback = self.map.to_theta(state.position_deg)
-        if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance_deg:
+        self._readback = self.map.to_theta(state.position)
+        if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance:
             return
         duration = self._profile.duration_s(abs(self._readback - target))
         if not self._started(lambda: self.driver.start_move(axis_deg), stopped):
             return
         yield from self._until_idle(f"the move to {target:g} deg", duration, stopped)
         if not stopped.is_set():
-            self.driver.check_arrival(axis_deg, self.tolerance_deg)
+            self.driver.check_arrival(axis_deg, self.tolerance)
             yield self.settle_s
         self.refresh()
 

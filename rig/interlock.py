@@ -28,19 +28,19 @@ class Interlock:
 
     Parameters
     ----------
-    limits_deg : mapping of axis name to (lowest, highest)
+    limits : mapping of axis name to (lowest, highest)
     keep_out : KeepOut
     arms : pair of axis names
         The two arms the keep-out speaks of: the source's and the detector's.
     """
 
-    limits_deg: Mapping[str, tuple[float, float]]
+    limits: Mapping[str, tuple[float, float]]
     keep_out: KeepOut
     arms: tuple[str, str] = ("source", "detector")
 
     def check_limits(self, axis: str, theta_deg: float) -> None:
         """Raise InterlockError where `theta_deg` lies outside the limits of `axis`."""
-        low, high = self.limits_deg[axis]
+        low, high = self.limits[axis]
         if not low <= theta_deg <= high:
             raise InterlockError(
                 f"axis {axis}: {theta_deg:g} deg is outside its limits {low:g} to {high:g} deg; "

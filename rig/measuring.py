@@ -81,7 +81,7 @@ def travel_estimate_s(order: Order) -> float:
             for name, axis in order.config.axes.items():
                 distance = abs(target[name] - before[name])
                 if distance:
-                    profile = MotionProfile(axis.speed_deg_s or 10.0, axis.acceleration_deg_s2 or 100.0)
+                    profile = MotionProfile(axis.speed or 10.0, axis.acceleration or 100.0)
                     moves.append(profile.duration_s(distance) + axis.settle_s)
             total += max(moves)
         total += order.trajectory.repeat * (order.config.sensor.integration_s + OVERHEAD_S)

@@ -16,7 +16,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from drivers.doubt import Doubt
 from drivers.endpoint import Endpoint, Veto
@@ -121,7 +121,7 @@ def find_version(line: bytes) -> tuple[str, str] | None:
 
 
 class NewportAxis:
-    """One axis of an ESP controller; satisfies `drivers.kinds.RotaryAxis`. All axes of a controller share its link.
+    """One axis of an ESP controller; satisfies `drivers.kinds.Stage`. All axes of a controller share its link.
 
     Parameters
     ----------
@@ -167,8 +167,8 @@ class NewportAxis:
         degrees_per_unit: float | None = None,
         home_search: int = 1,
         assume_homed: bool = False,
-        speed_deg_s: float | None = None,
-        acceleration_deg_s2: float | None = None,
+        speed: float | None = None,
+        acceleration: float | None = None,
     ) -> NewportAxis:
         """Meet the axis: read its units unless the scale is given, and set speed and acceleration if given. Nothing moves.
 
@@ -190,13 +190,18 @@ class NewportAxis:
                     hint="set the units to degrees, or give degrees_per_unit in the configuration",
                 )
             stage._scale = DEGREES_PER_UNIT[units]
-        stage.set_profile(speed_deg_s, acceleration_deg_s2)
+        stage.set_profile(speed, acceleration)
         return stage
 
     @property
     def name(self) -> str:
         """What the user calls it."""
         return self._wire.name
+
+    @property
+    def unit(self) -> Literal["deg"]:
+        """What it counts in."""
+        return "deg"
 
     @property
     def degrees_per_unit(self) -> float:
@@ -231,7 +236,7 @@ class NewportAxis:
                 self._homed = False  # an arm without power can be turned by hand
         return AxisState(position, moving=False, homed=self._homed, warnings=warnings)
 
-    def limits_deg(self) -> tuple[float, float]:
+    def limits(self) -> tuple[float, float]:
         """Read the axis' software limits, deg."""
         low = self._wire.number("SL?", "reading the lower limit")
         high = self._wire.number("SR?", "reading the upper limit")
@@ -257,7 +262,7 @@ class NewportAxis:
             )
         return MotionProfile(speed, acceleration)
 
-    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
+    def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
         """Set speed (deg/s), acceleration and deceleration alike (deg/s^2), or all of them.
 
         Raises
@@ -268,9 +273,9 @@ class NewportAxis:
             The axis refuses it.
         """
         settings = (
-            ("VA", speed_deg_s, "speed in deg/s"),
-            ("AC", acceleration_deg_s2, "acceleration in deg/s^2"),
-            ("AG", acceleration_deg_s2, "deceleration in deg/s^2"),
+            ("VA", speed, "speed in deg/s"),
+            ("AC", acceleration, "acceleration in deg/s^2"),
+            ("AG", acceleration, "deceleration in deg/s^2"),
         )
         commands = []
         for command, value, what in settings:
@@ -295,7 +300,7 @@ class NewportAxis:
         with self._stops.lock:
             self._homing = self._stops.count == stops  # only a search that nobody stopped gives a reference
 
-    def start_move(self, deg: float) -> None:
+    def start_move(self, deg: float, /) -> None:
         """Start an absolute move (deg).
 
         Raises
@@ -320,7 +325,7 @@ class NewportAxis:
                 "no reference position", attempt, kind=NotHomed, expected="an axis homed with its motor on", hint="home the axis first"
             )
         # Whether the controller refuses a target beyond its limits or drives up to them is not verified.
-        low, high = self.limits_deg()
+        low, high = self.limits()
         if not low <= deg <= high:
             raise self._wire.fault(f"{deg:.4f} deg is beyond the software limits", attempt, expected=f"{low:g} to {high:g} deg")
         self._wire.drain(attempt)
@@ -337,26 +342,31 @@ class NewportAxis:
             self._homing = False
         self._wire.stop()
 
-    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
+    def check_arrival(self, deg: float, tolerance: float, /) -> None:
         """Make sure that the axis rests at an angle (deg) because it got there.
 
         Raises
         ------
         DeviceFault
             An error of the axis or of the whole controller since the last start of a motion; or the axis still moves; or it rests
-            further than `tolerance_deg` from the angle.
+            further than `tolerance` from the angle.
         """
         state = self.state()
         attempt = f"arriving at {deg:.4f} deg"
         if state.warnings:
             code = int(state.warnings[0].partition(" ")[0])
             raise self._wire.fault(
-                f"{', '.join(state.warnings)} at {state.position_deg:.4f} deg",
+                f"{', '.join(state.warnings)} at {state.position:.4f} deg",
                 attempt,
                 expected="an undisturbed motion",
                 hint=_HINTS.get(code % 100, "") if code >= 100 else "find the cause, then home the axis",
             )
-        require_arrival(self._wire, state, deg, tolerance_deg, attempt)
+        require_arrival(self._wire, state, deg, tolerance, attempt)
+
+    def trust_reference(self) -> None:
+        """Take the axis as homed: somebody else saw it homed, and nothing has moved it since."""
+        with self._stops.lock:
+            self._homed = True
 
     def close(self) -> None:
         """Let go of the axis without moving it. The link stays open for the others on it."""

@@ -12,6 +12,7 @@ starts again (a motion is never sent twice), the exception code of a refused sta
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from drivers.endpoint import Veto
 from drivers.errors import DeviceFault, InvalidSetting, NotHomed
@@ -75,7 +76,7 @@ _RETURN_INCOMPLETE = 0x4A
 
 
 class OrientalAxis:
-    """One axis; satisfies `drivers.kinds.RotaryAxis`. Several may share a link, each at its own address.
+    """One axis; satisfies `drivers.kinds.Stage`. Several may share a link, each at its own address.
 
     Parameters
     ----------
@@ -87,7 +88,7 @@ class OrientalAxis:
         Set on the driver's rotary switch, 1 to 31.
     steps_per_degree : float
         Scale; the default is unverified.
-    limits_deg : tuple of float, deg
+    limits : tuple of float, deg
         Lower and upper end of travel, which the registers do not tell: a move beyond is refused here. Set the same in the driver.
     profile : MotionProfile
         Sent along with every move; the driver keeps none of its own.
@@ -104,20 +105,20 @@ class OrientalAxis:
         *,
         address: int = 1,
         steps_per_degree: float = STEPS_PER_DEGREE,
-        limits_deg: tuple[float, float] = (0.0, 360.0),
+        limits: tuple[float, float] = (0.0, 360.0),
         profile: MotionProfile | None = None,
         home_bit: int = ZHOME_BIT,
         home_end_holds: bool = True,
     ) -> None:
         if not (math.isfinite(steps_per_degree) and steps_per_degree > 0):
             raise InvalidSetting(f"steps_per_degree {steps_per_degree}", device=name, expected="a finite number above 0")
-        if not (math.isfinite(limits_deg[0]) and math.isfinite(limits_deg[1]) and limits_deg[0] < limits_deg[1]):
-            raise InvalidSetting(f"limits {limits_deg}", device=name, expected="two finite angles, the lower first")
+        if not (math.isfinite(limits[0]) and math.isfinite(limits[1]) and limits[0] < limits[1]):
+            raise InvalidSetting(f"limits {limits}", device=name, expected="two finite angles, the lower first")
         if not (0 <= home_bit <= 15 and home_bit != 5):
             raise InvalidSetting(f"home_bit {home_bit}", device=name, expected="0 to 15, and not 5, which stops")
         self._unit = ModbusUnit(link, name, address)
         self._scale = steps_per_degree
-        self._limits = limits_deg
+        self._limits = limits
         self._home = 1 << home_bit
         self._home_end_holds = home_end_holds
         self._was_home = False
@@ -125,7 +126,7 @@ class OrientalAxis:
         self._stops = Stops()
         self._input_left_on = False
         if profile is not None:
-            self.set_profile(profile.speed_deg_s, profile.acceleration_deg_s2)
+            self.set_profile(profile.speed, profile.acceleration)
 
     @classmethod
     def open(
@@ -137,8 +138,8 @@ class OrientalAxis:
         steps_per_degree: float = STEPS_PER_DEGREE,
         limit_min_deg: float = 0.0,
         limit_max_deg: float = 360.0,
-        speed_deg_s: float = 20.0,
-        acceleration_deg_s2: float = 100.0,
+        speed: float = 20.0,
+        acceleration: float = 100.0,
         home_bit: int = ZHOME_BIT,
         home_end_holds: bool = True,
     ) -> OrientalAxis:
@@ -154,8 +155,8 @@ class OrientalAxis:
             name,
             address=address,
             steps_per_degree=steps_per_degree,
-            limits_deg=(limit_min_deg, limit_max_deg),
-            profile=MotionProfile(speed_deg_s, acceleration_deg_s2),
+            limits=(limit_min_deg, limit_max_deg),
+            profile=MotionProfile(speed, acceleration),
             home_bit=home_bit,
             home_end_holds=home_end_holds,
         )
@@ -167,6 +168,11 @@ class OrientalAxis:
         """What the user calls it."""
         return self._unit.name
 
+    @property
+    def unit(self) -> Literal["deg"]:
+        """What it counts in."""
+        return "deg"
+
     def identify(self) -> Identity:
         """Make sure that it is there; its registers tell neither model, serial number nor firmware."""
         self._unit.echo("looking who is there")
@@ -177,13 +183,13 @@ class OrientalAxis:
         outputs, alarm = self._outputs("reading the state")
         (steps,) = self._unit.int32(self._unit.holding(_POSITION, 2, "reading the position"))
         return AxisState(
-            position_deg=steps / self._scale,
+            position=steps / self._scale,
             moving=bool(outputs & _MOVE),
             homed=self._homed(outputs, alarm),
             warnings=(f"ALARM {alarm:02X}",) if outputs & _ALARM else ("INFO",) if outputs & _INFO else (),
         )
 
-    def limits_deg(self) -> tuple[float, float]:
+    def limits(self) -> tuple[float, float]:
         """Lower and upper limit as configured, deg: the registers do not tell."""
         return self._limits
 
@@ -191,7 +197,7 @@ class OrientalAxis:
         """Speed and acceleration that go along with every move."""
         return self._profile
 
-    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
+    def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
         """Set speed (deg/s), acceleration (deg/s^2) or both for the moves to come, to the nearest value that can be sent.
 
         Raises
@@ -199,8 +205,8 @@ class OrientalAxis:
         InvalidSetting
             A value is not finite, or cannot be sent.
         """
-        speed = self._profile.speed_deg_s if speed_deg_s is None else speed_deg_s
-        acceleration = self._profile.acceleration_deg_s2 if acceleration_deg_s2 is None else acceleration_deg_s2
+        speed = self._profile.speed if speed is None else speed
+        acceleration = self._profile.acceleration if acceleration is None else acceleration
         numbers = []
         for what, value, most in (("speed in deg/s", speed, _FASTEST_HZ), ("acceleration in deg/s^2", acceleration, _STEEPEST)):
             if not (math.isfinite(value) and 1 <= round(value * self._scale) <= most):
@@ -224,7 +230,7 @@ class OrientalAxis:
         self._pulse(self._home, attempt, veto=veto)
         self._refuse_alarm(*self._outputs(attempt), attempt)
 
-    def start_move(self, deg: float) -> None:
+    def start_move(self, deg: float, /) -> None:
         """Start an absolute move (deg).
 
         Raises
@@ -246,7 +252,7 @@ class OrientalAxis:
         outputs, alarm = self._make_ready(attempt)
         if not self._homed(outputs, alarm):
             raise self._not_homed("HOME-END is off", attempt)
-        speed, rate = (round(value * self._scale) for value in (self._profile.speed_deg_s, self._profile.acceleration_deg_s2))
+        speed, rate = (round(value * self._scale) for value in (self._profile.speed, self._profile.acceleration))
         fields = (0, _ABSOLUTE, round(deg * self._scale), speed, rate, rate, _FULL_CURRENT, _ALL_FIELDS)
         self._unit.write(_OPERATION, self._unit.words_of_int32(*fields), attempt, veto=veto)
         # The write is acknowledged even when the operation ends in an alarm at once.
@@ -261,18 +267,18 @@ class OrientalAxis:
             self._stops.count += 1
         self._pulse(_STOP, "stopping", urgent=True)
 
-    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
+    def check_arrival(self, deg: float, tolerance: float, /) -> None:
         """Make sure that the axis rests at an angle (deg) because it got there.
 
         Raises
         ------
         DeviceFault
-            An alarm; or the axis still moves; or it rests further than `tolerance_deg` from the angle.
+            An alarm; or the axis still moves; or it rests further than `tolerance` from the angle.
         """
         attempt = f"arriving at {deg:.4f} deg"
         self._refuse_alarm(*self._outputs(attempt), attempt)
         state = self.state()
-        require_arrival(self._unit, state, deg, tolerance_deg, attempt)
+        require_arrival(self._unit, state, deg, tolerance, attempt)
 
     def reset_alarm(self) -> None:
         """Clear the alarm; its cause must be gone.

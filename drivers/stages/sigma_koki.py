@@ -142,7 +142,7 @@ class Speeds:
 
 
 class SigmaKokiAxis:
-    """One axis of a controller; satisfies `drivers.kinds.RotaryAxis`. Both axes share the controller's link.
+    """One axis of a controller; satisfies `drivers.kinds.Stage`. Both axes share the controller's link.
 
     `SigmaKokiAxis.open` sets the speeds; the bare constructor sends nothing.
 
@@ -210,8 +210,8 @@ class SigmaKokiAxis:
         high_deg: float = 180.0,
         home_direction: str = "-",
         assume_homed: bool = False,
-        speed_deg_s: float = 12.5,
-        acceleration_deg_s2: float = 60.0,
+        speed: float = 12.5,
+        acceleration: float = 60.0,
     ) -> SigmaKokiAxis:
         """Meet the axis: read the division of its steps unless the scale is given, and set its speeds. Nothing moves.
 
@@ -233,13 +233,18 @@ class SigmaKokiAxis:
         )
         if degrees_per_pulse is None and stage._dialect.answers:
             stage._scale = FULL_STEP_DEG / stage._wire.division("reading the division of steps")
-        stage.set_profile(speed_deg_s, acceleration_deg_s2)
+        stage.set_profile(speed, acceleration)
         return stage
 
     @property
     def name(self) -> str:
         """What the user calls it."""
         return self._wire.name
+
+    @property
+    def unit(self) -> Literal["deg"]:
+        """What it counts in."""
+        return "deg"
 
     @property
     def degrees_per_pulse(self) -> float:
@@ -266,13 +271,13 @@ class SigmaKokiAxis:
                     self._begin(waiting)
                     moving = True
             return AxisState(
-                position_deg=self._deg(status),
+                position=self._deg(status),
                 moving=moving or self._waiting is not None,
                 homed=self._homed,
                 warnings=("limit sensor",) if self._axis in status.limits else (),
             )
 
-    def limits_deg(self) -> tuple[float, float]:
+    def limits(self) -> tuple[float, float]:
         """The travel configured, deg: the controller knows none."""
         return self._travel
 
@@ -281,7 +286,7 @@ class SigmaKokiAxis:
         speeds = self._wire.controller.speeds[self._axis - 1]
         return MotionProfile(speeds.fast * self._scale, speeds.acceleration * self._scale)
 
-    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
+    def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
         """Set speed (deg/s), acceleration (deg/s^2) or both, to the nearest values the controller can express.
 
         Raises
@@ -291,13 +296,13 @@ class SigmaKokiAxis:
         DeviceFault
             The controller refuses, for instance because an axis moves.
         """
-        if speed_deg_s is None and acceleration_deg_s2 is None:
+        if speed is None and acceleration is None:
             return
         attempt = "setting speed and acceleration"
         with self._wire.lock:
             now = self.profile()
-            speed = now.speed_deg_s if speed_deg_s is None else speed_deg_s
-            acceleration = now.acceleration_deg_s2 if acceleration_deg_s2 is None else acceleration_deg_s2
+            speed = now.speed if speed is None else speed
+            acceleration = now.acceleration if acceleration is None else acceleration
             speeds = Speeds.nearest(speed / self._scale, acceleration / self._scale, self._dialect.most_speed)
             if speeds is None:
                 raise InvalidSetting(
@@ -321,7 +326,7 @@ class SigmaKokiAxis:
         self._homed = self._homing = False
         self._start(_Motion((f"C:{self._axis}1", f"H:{self._axis}{direction}"), "starting to home", self._stops.count, homes=True))
 
-    def start_move(self, deg: float) -> None:
+    def start_move(self, deg: float, /) -> None:
         """Start an absolute move (deg), or have it wait until the controller's other axis rests.
 
         Raises
@@ -361,24 +366,29 @@ class SigmaKokiAxis:
             self._waiting = None
         self._wire.stop()
 
-    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
+    def check_arrival(self, deg: float, tolerance: float, /) -> None:
         """Make sure that the axis rests at an angle (deg) because it got there.
 
         Raises
         ------
         DeviceFault
-            A limit sensor stopped the axis; or it still moves; or it rests further than `tolerance_deg` from the angle.
+            A limit sensor stopped the axis; or it still moves; or it rests further than `tolerance` from the angle.
         """
         state = self.state()
         attempt = f"arriving at {deg:.4f} deg"
         if state.warnings:
             raise self._wire.fault(
-                f"stopped by a limit sensor at {state.position_deg:.4f} deg",
+                f"stopped by a limit sensor at {state.position:.4f} deg",
                 attempt,
                 expected="an undisturbed motion",
                 hint="look for what is in the way, then home the axis",
             )
-        require_arrival(self._wire, state, deg, tolerance_deg, attempt)
+        require_arrival(self._wire, state, deg, tolerance, attempt)
+
+    def trust_reference(self) -> None:
+        """Take the axis as homed: somebody else saw it homed, and nothing has moved it since."""
+        with self._stops.lock:
+            self._homed = True
 
     def close(self) -> None:
         """Let go of the axis without moving it. The link stays open for the other one."""

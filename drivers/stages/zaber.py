@@ -1,10 +1,10 @@
-"""Zaber X-series rotary stages over Zaber's ASCII protocol.
+"""Zaber X-series stages, rotary and linear, over Zaber's ASCII protocol.
 
 Source: Zaber ASCII Protocol Manual (firmware 6 and 7). Every request carries a message id and a checksum, every reply must
 carry both back, so that a late or damaged reply is never taken for the answer.
 
-Not verified on hardware: the scale of ``accel`` (`ACCELERATION_UNIT`), and that every stage answers ``limit.cycle.dist``.
-Both can be given by the user.
+Not verified on hardware: the scale of ``accel`` (`ACCELERATION_UNIT`), and that every rotary stage answers ``limit.cycle.dist``.
+Both can be given by the user. A linear stage does not tell its scale: its data sheet gives the microstep size.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Literal
 
 from drivers.endpoint import Endpoint, Veto
 from drivers.errors import BadChecksum, DeviceFault, InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
-from drivers.kinds import AxisState, Identity, MotionProfile
+from drivers.kinds import AxisState, Identity, MotionProfile, Unit
 from drivers.link import Link
 from drivers.motion import Stops, require_arrival
 
@@ -184,7 +184,7 @@ def parse_message(line: bytes, *, checksum_required: bool = True) -> Message:
 
 
 class ZaberAxis:
-    """One axis of one Zaber device; satisfies `drivers.kinds.RotaryAxis`. Several may share a link.
+    """One axis of one Zaber device; satisfies `drivers.kinds.Stage`. Several may share a link.
 
     Parameters
     ----------
@@ -192,8 +192,10 @@ class ZaberAxis:
         Stays the caller's to close.
     name : str
         For messages.
-    microsteps_per_degree : float
-        Scale; `ZaberAxis.open` reads it from the stage.
+    microsteps_per_unit : float
+        Scale; `ZaberAxis.open` reads it from a rotary stage.
+    unit : str
+        ``deg``, or ``mm`` for a linear stage.
     address : int
         Device address on the chain.
     axis : int
@@ -209,19 +211,21 @@ class ZaberAxis:
         link: Link,
         name: str,
         *,
-        microsteps_per_degree: float,
+        microsteps_per_unit: float,
+        unit: Unit = "deg",
         address: int = 1,
         axis: int = 1,
         acceleration_unit: float = ACCELERATION_UNIT,
         checksums: bool = True,
     ) -> None:
-        if not (math.isfinite(microsteps_per_degree) and microsteps_per_degree > 0):
-            raise InvalidSetting(f"microsteps_per_degree {microsteps_per_degree}", device=name, expected="a finite number above 0")
+        if not (math.isfinite(microsteps_per_unit) and microsteps_per_unit > 0):
+            raise InvalidSetting(f"{microsteps_per_unit} microsteps per {unit}", device=name, expected="a finite number above 0")
         if not (math.isfinite(acceleration_unit) and acceleration_unit > 0):
             raise InvalidSetting(f"acceleration_unit {acceleration_unit}", device=name, expected="a finite number above 0")
         if not (1 <= address <= 99 and 1 <= axis <= 9):
             raise InvalidSetting(f"address {address}, axis {axis}", device=name, expected="address 1..99, axis 1..9")
-        self._scale = microsteps_per_degree
+        self._scale = microsteps_per_unit
+        self._unit: Unit = unit
         self._acceleration_unit = acceleration_unit
         self._wire = _Wire(link, name, address, axis, checksums)
         self._stops = Stops()
@@ -234,9 +238,10 @@ class ZaberAxis:
         *,
         address: int = 1,
         axis: int = 1,
-        microsteps_per_degree: float | None = None,
-        speed_deg_s: float | None = None,
-        acceleration_deg_s2: float | None = None,
+        microsteps_per_unit: float | None = None,
+        unit: Unit = "deg",
+        speed: float | None = None,
+        acceleration: float | None = None,
         acceleration_unit: float = ACCELERATION_UNIT,
         checksums: bool = True,
     ) -> ZaberAxis:
@@ -244,10 +249,15 @@ class ZaberAxis:
 
         Raises
         ------
+        InvalidSetting
+            The stage is linear and its scale is not given.
         DeviceFault
             The stage does not know its microsteps per revolution (``limit.cycle.dist``), or refuses a setting.
         """
-        if microsteps_per_degree is None:
+        if microsteps_per_unit is None and unit == "mm":
+            hint = "give microsteps_per_mm: 1000 over the microstep size in um, from the stage's data sheet"
+            raise InvalidSetting("no scale", device=name, port=link.url, attempt="opening a linear stage", hint=hint)
+        if microsteps_per_unit is None:
             wire = _Wire(link, name, address, axis, checksums)
             attempt = "reading the microsteps per revolution"
             try:
@@ -264,17 +274,18 @@ class ZaberAxis:
                     expected="microsteps per revolution",
                     hint="give microsteps_per_degree in the configuration",
                 )
-            microsteps_per_degree = per_revolution / 360
+            microsteps_per_unit = per_revolution / 360
         stage = cls(
             link,
             name,
-            microsteps_per_degree=microsteps_per_degree,
+            microsteps_per_unit=microsteps_per_unit,
+            unit=unit,
             address=address,
             axis=axis,
             acceleration_unit=acceleration_unit,
             checksums=checksums,
         )
-        stage.set_profile(speed_deg_s, acceleration_deg_s2)
+        stage.set_profile(speed, acceleration)
         return stage
 
     @property
@@ -283,7 +294,12 @@ class ZaberAxis:
         return self._wire.name
 
     @property
-    def microsteps_per_degree(self) -> float:
+    def unit(self) -> Unit:
+        """What it counts in."""
+        return self._unit
+
+    @property
+    def microsteps_per_unit(self) -> float:
         """Scale in use."""
         return self._scale
 
@@ -302,14 +318,14 @@ class ZaberAxis:
         reply = self._wire.read("get pos", "reading the position")
         flags = () if reply.flag == "--" else self._flags("warnings")
         return AxisState(
-            position_deg=self._wire.to_number(reply, "reading the position") / self._scale,
+            position=self._wire.to_number(reply, "reading the position") / self._scale,
             moving=reply.busy,
             homed=NO_REFERENCE.isdisjoint(flags),
             warnings=flags,
         )
 
-    def limits_deg(self) -> tuple[float, float]:
-        """Read the stage's own lower and upper limit, deg."""
+    def limits(self) -> tuple[float, float]:
+        """Read the stage's own lower and upper limit."""
         low = self._wire.number("limit.min", "reading the lower limit")
         high = self._wire.number("limit.max", "reading the upper limit")
         return low / self._scale, high / self._scale
@@ -333,8 +349,8 @@ class ZaberAxis:
             )
         return MotionProfile(speed * VELOCITY_UNIT / self._scale, acceleration * self._acceleration_unit / self._scale)
 
-    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None:
-        """Set speed (deg/s), acceleration (deg/s^2) or both, to the nearest value the stage can express.
+    def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
+        """Set speed (unit/s), acceleration (unit/s^2) or both, to the nearest value the stage can express.
 
         Raises
         ------
@@ -344,8 +360,8 @@ class ZaberAxis:
             The stage refuses it.
         """
         settings = (
-            ("maxspeed", speed_deg_s, VELOCITY_UNIT, "speed in deg/s"),
-            ("accel", acceleration_deg_s2, self._acceleration_unit, "acceleration in deg/s^2"),
+            ("maxspeed", speed, VELOCITY_UNIT, f"speed in {self._unit}/s"),
+            ("accel", acceleration, self._acceleration_unit, f"acceleration in {self._unit}/s^2"),
         )
         commands = []
         for setting, value, unit, what in settings:
@@ -366,24 +382,26 @@ class ZaberAxis:
         if reply.rejected:
             raise self._wire.rejection(reply, attempt)
 
-    def start_move(self, deg: float) -> None:
-        """Start an absolute move (deg).
+    def start_move(self, position: float, /) -> None:
+        """Start an absolute move.
 
         Raises
         ------
         InvalidSetting
-            The angle is not a finite number.
+            The position is not a finite number.
         NotHomed
             The stage has no reference position.
         DeviceFault
-            The stage refuses; with BADDATA, the angle is beyond its limits. Or `stop` came between.
+            The stage refuses; with BADDATA, the position is beyond its limits. Or `stop` came between.
         BadChecksum, TransportTimeout, UnexpectedReply
             It is unknown whether the stage moves: stop it.
         """
-        if not math.isfinite(deg):
-            raise InvalidSetting(f"angle {deg}", device=self.name, attempt="starting to move", expected="a finite angle in degrees")
-        attempt = f"starting to move to {deg:.4f} deg"
-        reply = self._start(f"move abs {round(deg * self._scale)}", attempt)
+        if not math.isfinite(position):
+            raise InvalidSetting(
+                f"position {position}", device=self.name, attempt="starting to move", expected=f"a finite number in {self._unit}"
+            )
+        attempt = f"starting to move to {position:.4f} {self._unit}"
+        reply = self._start(f"move abs {round(position * self._scale)}", attempt)
         if not reply.rejected:
             return
         # The reply names one flag only; a worse one may hide the missing reference.
@@ -406,27 +424,27 @@ class ZaberAxis:
             self._stops.count += 1
         self._wire.act("stop", "stopping", urgent=True)
 
-    def check_arrival(self, deg: float, tolerance_deg: float) -> None:
-        """Make sure that the stage rests at an angle (deg) because it got there.
+    def check_arrival(self, position: float, tolerance: float, /) -> None:
+        """Make sure that the stage rests at a position because it got there.
 
         Raises
         ------
         DeviceFault
             A fault flag (``F?``), an unexpected limit switch (``WL``) or an interruption (``NI``) since the last start of a
-            motion; or the stage still moves; or it rests further than `tolerance_deg` from the angle.
+            motion; or the stage still moves; or it rests further than `tolerance` from it.
         """
         state = self.state()
-        attempt = f"arriving at {deg:.4f} deg"
+        attempt = f"arriving at {position:.4f} {self._unit}"
         bad = [flag for flag in state.warnings if flag.startswith("F") or flag in ("WL", "NI")]
         if bad:
             meanings = ", ".join(f"{flag} ({_FLAG_NAMES.get(flag, 'fault')})" for flag in bad)
             raise self._wire.fault(
-                f"{meanings} at {state.position_deg:.4f} deg",
+                f"{meanings} at {state.position:.4f} {self._unit}",
                 attempt,
                 expected="an undisturbed motion",
                 hint="find the cause, then move or home again",
             )
-        require_arrival(self._wire, state, deg, tolerance_deg, attempt)
+        require_arrival(self._wire, state, position, tolerance, attempt, unit=self._unit)
 
     def close(self) -> None:
         """Let go of the stage without moving it. The link stays open for the others on it."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from drivers import catalogue
-from drivers.kinds import LightSensor, RotaryAxis
+from drivers.kinds import LightSensor, Stage
 from sim.serve import Running, Settings, in_background
 
 SPEED = 40.0
@@ -20,13 +20,13 @@ def world() -> Iterator[Running]:
 
 
 @pytest.fixture(params=AXES)
-def axis(request: pytest.FixtureRequest, world: Running) -> Iterator[RotaryAxis]:
+def axis(request: pytest.FixtureRequest, world: Running) -> Iterator[Stage]:
     """A rotary axis, fresh from its port."""
     name, options = AXES[request.param]
     model = catalogue.load().lookup(request.param)
     with model.open_link(world.url(name), timeout_s=1.0) as link:
         device = model.open_device(link, name="axis", **options)
-        assert isinstance(device, RotaryAxis)
+        assert isinstance(device, Stage)
         yield device
         device.stop()
 

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from drivers import catalogue
-from drivers.catalogue import BUILT_IN, DeviceModel, Option
+from drivers.builtin import BUILT_IN
 from drivers.errors import CatalogueError, InvalidSetting, TransportTimeout, UnknownModel
+from drivers.models import DeviceModel, Option
 from drivers.sensors.keithley6485 import Keithley6485
 from drivers.stages.zaber import ZaberAxis
 
@@ -136,7 +137,7 @@ def test_opening_a_stage(plug: Any, script: Any) -> None:
     model = catalogue.lookup("zaber-x-rst120ak")
     axis = model.open_device(link, name="theta_i", address=3, microsteps_per_degree=10, checksums=False)
     assert isinstance(axis, ZaberAxis)
-    assert axis.state().position_deg == 10
+    assert axis.state().position == 10
 
 
 def test_opening_a_meter_over_its_own_link(script: Any, make_peer: Any) -> None:
@@ -171,8 +172,8 @@ def test_opening_an_absent_port() -> None:
         ({"address": True}, "option address"),
         ({"address": None}, "option address"),
         ({"checksums": 1}, "option checksums"),
-        ({"speed_deg_s": float("nan")}, "option speed_deg_s"),
-        ({"speed_deg_s": "fast"}, "option speed_deg_s"),
+        ({"speed": float("nan")}, "option speed"),
+        ({"speed": "fast"}, "option speed"),
     ],
 )
 def test_nonsense_options(plug: Any, options: dict[str, Any], complaint: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.errors import MoveTimeout, PortClosed, TransportTimeout
-from drivers.kinds import AxisState, Identity, MotionProfile, RotaryAxis
+from drivers.kinds import AxisState, Identity, MotionProfile, Stage
 from drivers.motion import wait_until_idle
 
 
@@ -28,6 +28,7 @@ class Axis:
     """Arrives at a time of its own."""
 
     name = "theta_r"
+    unit = "deg"
 
     def __init__(self, clock: Clock, arrives_s: float) -> None:
         self.clock = clock
@@ -51,19 +52,19 @@ class Axis:
     def identify(self) -> Identity:
         return Identity("", "", "", "")
 
-    def limits_deg(self) -> tuple[float, float]:
+    def limits(self) -> tuple[float, float]:
         return 0.0, 360.0
 
     def profile(self) -> MotionProfile:
         return MotionProfile(1, 1)
 
-    def set_profile(self, speed_deg_s: float | None = None, acceleration_deg_s2: float | None = None) -> None: ...
+    def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None: ...
 
     def start_home(self) -> None: ...
 
     def start_move(self, deg: float) -> None: ...
 
-    def check_arrival(self, deg: float, tolerance_deg: float) -> None: ...
+    def check_arrival(self, deg: float, tolerance: float) -> None: ...
 
     def close(self) -> None: ...
 
@@ -71,7 +72,7 @@ class Axis:
 def test_one_poll_when_the_prediction_holds() -> None:
     clock = Clock()
     axis = Axis(clock, 3.0)
-    assert isinstance(axis, RotaryAxis)
+    assert isinstance(axis, Stage)
     state = wait_until_idle(axis, 3.0, timeout_s=5, clock=clock)
     assert not state.moving
     assert axis.polls == [103.0]

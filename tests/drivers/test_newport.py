@@ -14,7 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
-from drivers.kinds import Identity, RotaryAxis
+from drivers.kinds import Identity, Stage
 from drivers.link import Link
 from drivers.stages.newport import EspError, NewportAxis, find_version, parse_error, parse_number
 from sim.clock import SimClock
@@ -115,7 +115,7 @@ def rest(position: bytes, *errors: bytes) -> tuple[bytes, ...]:
 
 
 def test_it_is_a_rotary_axis(plug: Any) -> None:
-    assert isinstance(NewportAxis(plug(), "theta_r"), RotaryAxis)
+    assert isinstance(NewportAxis(plug(), "theta_r"), Stage)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_open_reads_the_units_and_sets_the_profile(plug: Any, script: Any, units
     speed, acceleration = (f"{value / degrees:.6f}".encode() for value in (20, 80))
     settings = [line for command in (b"2VA" + speed, b"2AC" + acceleration, b"2AG" + acceleration) for line in (command + b";TB?\r", NONE)]
     link = plug(*script.dialogue(*HELLO, b"2SN?\r", units + b"\r\n", *settings))
-    stage = NewportAxis.open(link, "theta_i", axis=2, speed_deg_s=20, acceleration_deg_s2=80)
+    stage = NewportAxis.open(link, "theta_i", axis=2, speed=20, acceleration=80)
     assert stage.degrees_per_unit == pytest.approx(degrees)
 
 
@@ -149,7 +149,7 @@ def test_identity(axis: Any) -> None:
 def test_state_at_rest_reads_the_position_until_two_readings_agree(axis: Any) -> None:
     spoilt = (b"1TP?\r", b"4.0002\r\n", b"1TP?\r", b"45.0002\r\n", b"1TP?\r", b"45.0000\r\n")
     state = axis(b"1TP?\r", b"45.0002\r\n", b"1MD?\r", b"1\r\n", b"1MO?\r", b"1\r\n", *QUIET, *spoilt).state()
-    assert (state.position_deg, state.moving, state.homed, state.warnings) == (45.0, False, True, ())
+    assert (state.position, state.moving, state.homed, state.warnings) == (45.0, False, True, ())
 
 
 def test_a_position_that_never_repeats_itself_is_not_believed(axis: Any) -> None:
@@ -161,7 +161,7 @@ def test_a_position_that_never_repeats_itself_is_not_believed(axis: Any) -> None
 
 def test_state_on_the_way(axis: Any) -> None:
     state = axis(b"1TP?\r", b"-1.25\r\n", b"1MD?\r", b"0\r\n").state()
-    assert (state.position_deg, state.moving) == (-1.25, True)
+    assert (state.position, state.moving) == (-1.25, True)
 
 
 def test_without_motor_power_it_is_not_homed(axis: Any) -> None:
@@ -195,9 +195,9 @@ def test_yes_or_no_is_nothing_else(axis: Any, answer: bytes) -> None:
 
 def test_limits_and_profile(axis: Any) -> None:
     stage = axis(*LIMITS, b"1VA?\r", b"20.0\r\n", b"1AC?\r", b"90.0\r\n", b"1AG?\r", b"80.0\r\n")
-    assert stage.limits_deg() == (-170.0, 170.0)
+    assert stage.limits() == (-170.0, 170.0)
     profile = stage.profile()
-    assert (profile.speed_deg_s, profile.acceleration_deg_s2) == (20.0, 80.0)
+    assert (profile.speed, profile.acceleration) == (20.0, 80.0)
 
 
 def test_a_profile_of_zero_is_not_a_profile(axis: Any) -> None:
@@ -209,15 +209,15 @@ def test_a_profile_of_zero_is_not_a_profile(axis: Any) -> None:
 def test_impossible_speeds_are_not_sent(plug: Any, value: float) -> None:
     stage = NewportAxis(plug(), "theta_r")
     with pytest.raises(InvalidSetting):
-        stage.set_profile(speed_deg_s=value)
+        stage.set_profile(speed=value)
     with pytest.raises(InvalidSetting):
-        stage.set_profile(speed_deg_s=1.0, acceleration_deg_s2=value)
+        stage.set_profile(speed=1.0, acceleration=value)
 
 
 @pytest.mark.parametrize("code", [110, 101, 6, 7, 38])
 def test_settings_the_axis_refuses(axis: Any, code: int) -> None:
     with pytest.raises(DeviceFault, match=f"refused with error {code} SOMETHING"):
-        axis(b"1VA2000.000000;TB?\r", b"%d, 5, SOMETHING\r\n" % code, *QUIET).set_profile(speed_deg_s=2000)
+        axis(b"1VA2000.000000;TB?\r", b"%d, 5, SOMETHING\r\n" % code, *QUIET).set_profile(speed=2000)
 
 
 def test_home_switches_the_motor_on_and_is_over_when_the_motion_is(axis: Any) -> None:
@@ -322,7 +322,7 @@ def test_a_damaged_answer_to_a_home_is_not_asked_for_again(axis: Any) -> None:
 def test_a_garbled_answer_is_asked_for_again_after_finding_step(axis: Any) -> None:
     moving = (b"1MD?\r", b"0\r\n")
     stage = axis(b"1TP?\r", b"4\x855.0\r\n", *HELLO, b"1TP?\r", b"45.0\r\n", *moving)
-    assert stage.state().position_deg == 45.0
+    assert stage.state().position == 45.0
 
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_question(plug: Any, script: Any) -> None:
@@ -332,7 +332,7 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_question(plug: Any, scr
         *script.dialogue(b"VE?\r", b"99.0\r\n" + HELLO[1], b"1TP?\r", b"45.0\r\n", b"1MD?\r", b"0\r\n"),
         timeout_s=SHORT_S,
     )
-    assert NewportAxis(link, "theta_r").state().position_deg == 45.0
+    assert NewportAxis(link, "theta_r").state().position == 45.0
 
 
 def test_doubt_is_shared_by_the_axes_of_a_link(plug: Any, script: Any) -> None:
@@ -344,12 +344,12 @@ def test_doubt_is_shared_by_the_axes_of_a_link(plug: Any, script: Any) -> None:
     one, two = (NewportAxis(link, f"axis {number}", axis=number, assume_homed=True) for number in (1, 2))
     with pytest.raises(TransportTimeout):
         one.start_move(10)
-    assert two.state().position_deg == 5.0
+    assert two.state().position == 5.0
 
 
 @pytest.mark.parametrize("other", [NONE, HELLO[1], b"0, 1, X\r\n"])
 def test_lines_of_another_shape_are_not_the_answer(axis: Any, other: bytes) -> None:
-    assert axis(b"1TP?\r", other + b"45.0\r\n", b"1MD?\r", b"0\r\n").state().position_deg == 45.0
+    assert axis(b"1TP?\r", other + b"45.0\r\n", b"1MD?\r", b"0\r\n").state().position == 45.0
 
 
 # stopping -------------------------------------------------------------------------------------------------------------
@@ -370,7 +370,7 @@ def test_stop_overtakes_a_blocked_exchange_and_both_get_their_answers(plug: Any,
         waiting = pool.submit(one.state)
         assert blocked.wait(5)
         two.stop()
-        assert waiting.result().position_deg == 45.0
+        assert waiting.result().position == 45.0
 
 
 def test_a_move_that_has_not_gone_out_is_dropped_by_a_stop(plug: Any, script: Any) -> None:

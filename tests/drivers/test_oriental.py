@@ -24,7 +24,7 @@ from drivers.errors import (
     TransportTimeout,
     UnexpectedReply,
 )
-from drivers.kinds import MotionProfile, RotaryAxis
+from drivers.kinds import MotionProfile, Stage
 from drivers.link import Link
 from drivers.modbus import ModbusLink, ModbusRefusal
 from drivers.motion import wait_until_idle
@@ -95,10 +95,10 @@ def test_a_move_the_other_way_with_another_scale_and_profile(axis: Any) -> None:
     stage = axis(
         *(ASK_OUTPUTS, READY, move, framed("01 10 00 58 00 10"), ASK_OUTPUTS, MOVING),
         steps_per_degree=10.0,
-        limits_deg=(-90.0, 90.0),
+        limits=(-90.0, 90.0),
         profile=MotionProfile(0.1, 0.2),
     )
-    assert stage.limits_deg() == (-90.0, 90.0)
+    assert stage.limits() == (-90.0, 90.0)
     stage.start_move(-1.0)
 
 
@@ -114,7 +114,7 @@ def test_a_move_the_other_way_with_another_scale_and_profile(axis: Any) -> None:
 )
 def test_state(axis: Any, reply: bytes, position: str, expected: tuple[float, bool, bool, tuple[str, ...]]) -> None:
     state = axis(ASK_OUTPUTS, reply, ASK_POSITION, framed(f"01 03 04 {position}")).state()
-    assert (state.position_deg, state.moving, state.homed, state.warnings) == expected
+    assert (state.position, state.moving, state.homed, state.warnings) == expected
 
 
 def test_an_alarm_output_without_an_alarm_makes_no_sense(axis: Any) -> None:
@@ -207,9 +207,9 @@ def test_impossible_profiles_are_not_taken(axis: Any, value: float) -> None:
     stage = axis()
     before = stage.profile()
     with pytest.raises(InvalidSetting):
-        stage.set_profile(speed_deg_s=value)
+        stage.set_profile(speed=value)
     with pytest.raises(InvalidSetting):
-        stage.set_profile(speed_deg_s=30.0, acceleration_deg_s2=value)
+        stage.set_profile(speed=30.0, acceleration=value)
     assert stage.profile() == before
 
 
@@ -217,8 +217,8 @@ def test_impossible_profiles_are_not_taken(axis: Any, value: float) -> None:
     "options",
     [
         {"steps_per_degree": 0.0},
-        {"limits_deg": (10.0, 0.0)},
-        {"limits_deg": (0.0, math.nan)},
+        {"limits": (10.0, 0.0)},
+        {"limits": (0.0, math.nan)},
         {"home_bit": 5},
         {"home_bit": 16},
         {"address": 0},
@@ -265,11 +265,11 @@ def bench(request: pytest.FixtureRequest) -> Iterator[Rig]:
     with served(lambda: ModbusBus(clock, {1: simulated}, "az", "az", turnaround_s=0.003)) as (_, ports):
         url = ports.tcp if request.param == "tcp" else ports.pty
         with ModbusLink.open(url, timeout_s=2.0, baudrate=115200) as link:
-            yield Rig(OrientalAxis.open(link, "theta_i", speed_deg_s=60.0, acceleration_deg_s2=600.0), link, simulated, clock.now)
+            yield Rig(OrientalAxis.open(link, "theta_i", speed=60.0, acceleration=600.0), link, simulated, clock.now)
 
 
 def test_home_move_and_arrive(bench: Rig) -> None:
-    assert isinstance(bench.axis, RotaryAxis)
+    assert isinstance(bench.axis, Stage)
     assert not bench.axis.state().homed
     with pytest.raises(NotHomed):
         bench.axis.start_move(10.0)
@@ -292,7 +292,7 @@ def test_stop_on_the_way(bench: Rig) -> None:
     bench.axis.stop()
     bench.axis.stop()
     bench.settle()
-    assert bench.axis.state().position_deg < 299.0
+    assert bench.axis.state().position < 299.0
     bench.axis.start_move(20.0)
     bench.settle()
     bench.axis.check_arrival(20.0, 0.001)
@@ -319,10 +319,10 @@ def test_a_stall_under_way_is_a_fault_until_it_is_cleared(bench: Rig) -> None:
 
 def test_the_driver_s_own_limits_refuse_what_ours_let_through(bench: Rig) -> None:
     bench.home()
-    wide = OrientalAxis(bench.link, "theta_i", limits_deg=(-10.0, 400.0))
+    wide = OrientalAxis(bench.link, "theta_i", limits=(-10.0, 400.0))
     with pytest.raises(DeviceFault, match="alarm 67h, software overtravel"):
         wide.start_move(361.0)
-    assert wide.state().position_deg == 0.0
+    assert wide.state().position == 0.0
 
 
 def test_a_lost_origin_is_not_homed(bench: Rig) -> None:
@@ -346,4 +346,4 @@ def test_random_registers_give_only_named_errors(told: bytes, position: bytes) -
 
     with contextlib.suppress(UnexpectedReply):
         state = OrientalAxis(link_to(answer), "theta_i").state()
-        assert state.position_deg == int.from_bytes(position, "big", signed=True) / 50
+        assert state.position == int.from_bytes(position, "big", signed=True) / 50

@@ -14,7 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
-from drivers.kinds import Identity, RotaryAxis
+from drivers.kinds import Identity, Stage
 from drivers.link import Link
 from drivers.stages.sigma_koki import SigmaKokiAxis, Speeds, Status, find_version, parse_status
 from sim.clock import SimClock
@@ -115,7 +115,7 @@ def axis(plug: Any, script: Any) -> Any:
 
 
 def test_it_is_a_rotary_axis(plug: Any) -> None:
-    assert isinstance(SigmaKokiAxis(plug(), "theta_r"), RotaryAxis)
+    assert isinstance(SigmaKokiAxis(plug(), "theta_r"), Stage)
 
 
 def test_open_reads_the_division_and_sets_the_speeds(plug: Any, script: Any) -> None:
@@ -123,7 +123,7 @@ def test_open_reads_the_division_and_sets_the_speeds(plug: Any, script: Any) -> 
     stage = SigmaKokiAxis.open(link, "theta_i", axis=2)
     assert stage.degrees_per_pulse == pytest.approx(0.0005)
     profile = stage.profile()
-    assert (profile.speed_deg_s, profile.acceleration_deg_s2) == pytest.approx((12.5, 60.0), rel=0.005)
+    assert (profile.speed, profile.acceleration) == pytest.approx((12.5, 60.0), rel=0.005)
 
 
 def test_open_on_a_gsc_02_sets_the_speeds_of_both_axes_and_looks_whether_they_were_taken(plug: Any, script: Any) -> None:
@@ -137,7 +137,7 @@ def test_identity(axis: Any) -> None:
 
 def test_state_at_rest_is_read_until_two_answers_agree(axis: Any) -> None:
     state = axis(b"Q:", b"     16000,-     4000,K,K,R", b"Q:", READY, b"Q:", READY).state()
-    assert (state.position_deg, state.moving, state.homed, state.warnings) == (45.0, False, True, ())
+    assert (state.position, state.moving, state.homed, state.warnings) == (45.0, False, True, ())
 
 
 def test_a_position_that_never_repeats_itself_is_not_believed(axis: Any) -> None:
@@ -148,7 +148,7 @@ def test_a_position_that_never_repeats_itself_is_not_believed(axis: Any) -> None
 
 def test_state_of_the_second_axis_on_the_way(axis: Any) -> None:
     state = axis(b"Q:", BUSY, axis=2).state()
-    assert (state.position_deg, state.moving) == (-10.0, True)
+    assert (state.position, state.moving) == (-10.0, True)
 
 
 @pytest.mark.parametrize(("deg", "words"), [(10.0, b"+P4000"), (-10.0, b"-P4000"), (0.0, b"+P0"), (0.0012, b"+P0"), (0.0013, b"+P1")])
@@ -231,7 +231,7 @@ def test_moves_to_nowhere_are_not_sent(plug: Any, deg: float) -> None:
 @pytest.mark.parametrize("deg", [-90.01, 120.01])
 def test_moves_beyond_the_travel_are_not_sent(plug: Any, deg: float) -> None:
     stage = SigmaKokiAxis(plug(), "theta_r", assume_homed=True, low_deg=-90, high_deg=120)
-    assert stage.limits_deg() == (-90, 120)
+    assert stage.limits() == (-90, 120)
     with pytest.raises(DeviceFault, match="beyond the travel"):
         stage.start_move(deg)
 
@@ -291,9 +291,7 @@ def test_a_lost_answer_to_a_start_is_not_asked_for_again(plug: Any, script: Any)
         SigmaKokiAxis(link, "theta_r", assume_homed=True).start_move(10)
 
 
-@pytest.mark.parametrize(
-    "options", [{"speed_deg_s": 0.0}, {"speed_deg_s": math.nan}, {"speed_deg_s": 1300.0}, {"acceleration_deg_s2": 1.0}]
-)
+@pytest.mark.parametrize("options", [{"speed": 0.0}, {"speed": math.nan}, {"speed": 1300.0}, {"acceleration": 1.0}])
 def test_impossible_profiles_are_not_sent(plug: Any, options: dict[str, float]) -> None:
     with pytest.raises(InvalidSetting):
         SigmaKokiAxis(plug(), "theta_r").set_profile(**options)
@@ -304,7 +302,7 @@ def test_impossible_profiles_are_not_sent(plug: Any, options: dict[str, float]) 
 
 def test_a_garbled_answer_is_asked_for_again_after_finding_step(axis: Any) -> None:
     stage = axis(b"Q:", BUSY[1:], *(line[:-2] for line in HELLO), b"Q:", BUSY)
-    assert stage.state().position_deg == 45.0
+    assert stage.state().position == 45.0
 
 
 def test_a_late_answer_is_not_taken_for_that_of_the_next_question(plug: Any, script: Any) -> None:
@@ -314,12 +312,12 @@ def test_a_late_answer_is_not_taken_for_that_of_the_next_question(plug: Any, scr
         *script.dialogue(HELLO[0], late + HELLO[1], *says(b"Q:", BUSY)),
         timeout_s=SHORT_S,
     )
-    assert SigmaKokiAxis(link, "theta_r").state().position_deg == 45.0
+    assert SigmaKokiAxis(link, "theta_r").state().position == 45.0
 
 
 @pytest.mark.parametrize("other", [b"OK", b"NG", b"R", b"B"])
 def test_lines_of_another_shape_are_not_the_answer(axis: Any, other: bytes) -> None:
-    assert axis(b"Q:", other + b"\r\n" + BUSY).state().position_deg == 45.0
+    assert axis(b"Q:", other + b"\r\n" + BUSY).state().position == 45.0
 
 
 # stopping and arriving ------------------------------------------------------------------------------------------------
@@ -338,7 +336,7 @@ def test_stop_overtakes_a_blocked_exchange_and_both_get_their_answers(plug: Any,
         waiting = pool.submit(one.state)
         assert blocked.wait(5)
         two.stop()
-        assert waiting.result().position_deg == 45.0
+        assert waiting.result().position == 45.0
 
 
 def test_a_move_that_is_armed_and_not_started_is_dropped_by_a_stop(plug: Any, script: Any) -> None:
@@ -427,7 +425,7 @@ def bench(request: pytest.FixtureRequest) -> Iterator[tuple[SigmaKoki, SigmaKoki
         served(lambda: SigmaKoki(SimClock(40.0), [100.0, 30.0], kind)) as (sigma, ports),
         Link.open(ports.tcp, timeout_s=5.0, terminator=b"\r\n") as link,
     ):
-        options: dict[str, Any] = {"controller": controller, "speed_deg_s": 40.0, "acceleration_deg_s2": 200.0}
+        options: dict[str, Any] = {"controller": controller, "speed": 40.0, "acceleration": 200.0}
         yield sigma, SigmaKokiAxis.open(link, "theta_i", axis=1, **options), SigmaKokiAxis.open(link, "theta_r", axis=2, **options)
 
 

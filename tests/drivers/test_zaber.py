@@ -21,7 +21,7 @@ from drivers.errors import (
     TransportTimeout,
     UnexpectedReply,
 )
-from drivers.kinds import Identity, RotaryAxis
+from drivers.kinds import Identity, Stage
 from drivers.stages.zaber import ZaberAxis, checksum, encode_command, parse_message
 
 SCALE = 1_536_000 / 360  # microsteps per degree of an RSW60A at its default resolution
@@ -178,13 +178,13 @@ def axis(plug: Any, script: Any) -> Any:
     """An axis whose other end follows the dialogue given."""
 
     def make(*lines: str, **options: Any) -> ZaberAxis:
-        return ZaberAxis(plug(*talk(script, *lines)), "theta_r", microsteps_per_degree=SCALE, **options)
+        return ZaberAxis(plug(*talk(script, *lines)), "theta_r", microsteps_per_unit=SCALE, **options)
 
     return make
 
 
 def test_it_is_a_rotary_axis(axis: Any) -> None:
-    assert isinstance(axis(), RotaryAxis)
+    assert isinstance(axis(), Stage)
 
 
 def test_open_reads_the_scale(plug: Any, script: Any) -> None:
@@ -196,12 +196,12 @@ def test_open_reads_the_scale(plug: Any, script: Any) -> None:
             *("/2 1 01 set accel 14", "@02 1 01 OK IDLE WR 0"),
         )
     )
-    stage = ZaberAxis.open(link, "theta_i", address=2, speed_deg_s=20, acceleration_deg_s2=20)
-    assert stage.microsteps_per_degree == pytest.approx(1 / 0.000234375)  # the step size on the sheet
+    stage = ZaberAxis.open(link, "theta_i", address=2, speed=20, acceleration=20)
+    assert stage.microsteps_per_unit == pytest.approx(1 / 0.000234375)  # the step size on the sheet
 
 
 def test_open_with_a_given_scale_asks_nothing(plug: Any) -> None:
-    assert ZaberAxis.open(plug(), "theta_i", microsteps_per_degree=100.0).microsteps_per_degree == 100
+    assert ZaberAxis.open(plug(), "theta_i", microsteps_per_unit=100.0).microsteps_per_unit == 100
 
 
 def test_open_without_any_scale_says_what_to_do(plug: Any, script: Any) -> None:
@@ -227,13 +227,13 @@ def test_identity(axis: Any) -> None:
 
 def test_state_at_rest(axis: Any) -> None:
     state = axis("/1 1 00 get pos", "@01 1 00 OK IDLE -- 192000").state()
-    assert (state.position_deg, state.moving, state.homed, state.warnings) == (45.0, False, True, ())
+    assert (state.position, state.moving, state.homed, state.warnings) == (45.0, False, True, ())
 
 
 def test_state_on_the_way(axis: Any) -> None:
     state = axis("/1 1 00 get pos", "@01 1 00 OK BUSY -- -4267").state()
     assert state.moving
-    assert state.position_deg == pytest.approx(-1.0, abs=1e-3)
+    assert state.position == pytest.approx(-1.0, abs=1e-3)
 
 
 def test_state_tells_all_flags_and_the_hidden_missing_reference(axis: Any) -> None:
@@ -256,22 +256,22 @@ def test_flags_that_do_not_add_up(axis: Any) -> None:
 
 def test_limits(axis: Any) -> None:
     stage = axis("/1 1 00 get limit.min", "@01 1 00 OK IDLE -- -768000", "/1 1 01 get limit.max", "@01 1 01 OK IDLE -- 768000")
-    assert stage.limits_deg() == (-180.0, 180.0)
+    assert stage.limits() == (-180.0, 180.0)
 
 
 def test_profile(axis: Any) -> None:
     """1.6384 units of maxspeed are one microstep per second."""
     stage = axis("/1 1 00 get maxspeed", "@01 1 00 OK IDLE -- 139810", "/1 1 01 get accel", "@01 1 01 OK IDLE -- 14")
     profile = stage.profile()
-    assert profile.speed_deg_s == pytest.approx(20, rel=1e-5)
-    assert profile.acceleration_deg_s2 == pytest.approx(14 * 10_000 / 1.6384 / SCALE)
+    assert profile.speed == pytest.approx(20, rel=1e-5)
+    assert profile.acceleration == pytest.approx(14 * 10_000 / 1.6384 / SCALE)
 
 
 def test_profile_with_another_acceleration_unit(axis: Any) -> None:
     stage = axis(
         *("/1 1 00 get maxspeed", "@01 1 00 OK IDLE -- 139810"), *("/1 1 01 get accel", "@01 1 01 OK IDLE -- 14"), acceleration_unit=SCALE
     )
-    assert stage.profile().acceleration_deg_s2 == pytest.approx(14)
+    assert stage.profile().acceleration == pytest.approx(14)
 
 
 def test_a_profile_of_zero_is_not_a_profile(axis: Any) -> None:
@@ -283,14 +283,14 @@ def test_a_profile_of_zero_is_not_a_profile(axis: Any) -> None:
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan, math.inf, 1e-9])
 def test_impossible_speeds_are_not_sent(axis: Any, speed: float) -> None:
     with pytest.raises(InvalidSetting):
-        axis().set_profile(speed_deg_s=speed)
+        axis().set_profile(speed=speed)
     with pytest.raises(InvalidSetting):
-        axis().set_profile(speed_deg_s=1.0, acceleration_deg_s2=speed * 1e-6)
+        axis().set_profile(speed=1.0, acceleration=speed * 1e-6)
 
 
 def test_a_speed_the_stage_refuses(axis: Any) -> None:
     with pytest.raises(DeviceFault, match="rejected with BADDATA"):
-        axis("/1 1 00 set maxspeed 13981013", "@01 1 00 RJ IDLE -- BADDATA").set_profile(speed_deg_s=2000)
+        axis("/1 1 00 set maxspeed 13981013", "@01 1 00 RJ IDLE -- BADDATA").set_profile(speed=2000)
 
 
 def test_home(axis: Any) -> None:
@@ -340,32 +340,32 @@ def test_a_lost_reply_to_a_move_is_not_asked_for_again(plug: Any, script: Any) -
     """Strict script: a second move command would fail it."""
     link = plug(*talk(script, *CLEAR, "/1 1 01 move abs 192000"), timeout_s=SHORT_S)
     with pytest.raises(TransportTimeout, match="theta_r on /dev/"):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).start_move(45)
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).start_move(45)
 
 
 def test_a_lost_reply_to_a_home_is_not_asked_for_again(plug: Any, script: Any) -> None:
     link = plug(*talk(script, *CLEAR, "/1 1 01 home"), timeout_s=SHORT_S)
     with pytest.raises(TransportTimeout, match=r"theta_r on /dev/"):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).start_home()
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).start_home()
 
 
 def test_a_lost_reply_to_a_setting_is_not_asked_for_again(plug: Any, script: Any) -> None:
     link = plug(*talk(script, "/1 1 00 set maxspeed 139810"), timeout_s=SHORT_S)
     with pytest.raises(TransportTimeout, match=r"theta_r on /dev/"):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).set_profile(speed_deg_s=20)
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).set_profile(speed=20)
 
 
 def test_a_damaged_reply_to_a_move_is_not_asked_for_again(plug: Any, script: Any) -> None:
     link = plug(*talk(script, *CLEAR, "/1 1 01 move abs 192000"), script.send(b"@01 1 01 OK BUSY -- 0:00\r\n"))
     with pytest.raises(BadChecksum):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).start_move(45)
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).start_move(45)
 
 
 def test_ids_go_round(plug: Any, script: Any) -> None:
     ids = [number % 100 for number in range(103)]
     lines = [line for number in ids for line in (f"/1 1 {number:02d} get pos", f"@01 1 {number:02d} OK IDLE -- {number}")]
-    stage = ZaberAxis(plug(*talk(script, *lines)), "theta_r", microsteps_per_degree=1)
-    assert [stage.state().position_deg for _ in ids] == ids
+    stage = ZaberAxis(plug(*talk(script, *lines)), "theta_r", microsteps_per_unit=1)
+    assert [stage.state().position for _ in ids] == ids
 
 
 # what else is on the line ---------------------------------------------------------------------------------------------
@@ -388,7 +388,7 @@ def test_ids_go_round(plug: Any, script: Any) -> None:
 )
 def test_other_lines_are_not_the_answer(plug: Any, script: Any, other: bytes) -> None:
     link = plug(script.expect(says("/1 1 00 get pos")), script.send(other + answers("@01 1 00 OK IDLE -- 192000")))
-    assert ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).state().position_deg == 45
+    assert ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).state().position == 45
 
 
 def test_only_other_lines_is_a_timeout(plug: Any, script: Any) -> None:
@@ -396,7 +396,7 @@ def test_only_other_lines_is_a_timeout(plug: Any, script: Any) -> None:
     question = says("/1 1 00 get pos")
     link = plug(script.expect(question), script.send(stale), script.expect(question), script.send(stale), timeout_s=SHORT_S)
     with pytest.raises(TransportTimeout) as caught:
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).state()
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).state()
     assert caught.value.raw == stale
 
 
@@ -404,14 +404,14 @@ def test_only_other_lines_is_a_timeout(plug: Any, script: Any) -> None:
 def test_a_damaged_answer_to_a_read_is_asked_for_once_more(plug: Any, script: Any, damaged: bytes) -> None:
     question = says("/1 1 00 get pos")
     link = plug(*script.dialogue(question, damaged, question, answers("@01 1 00 OK IDLE -- 192000")))
-    assert ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).state().position_deg == 45
+    assert ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).state().position == 45
 
 
 def test_a_line_that_stays_bad(plug: Any, script: Any) -> None:
     question, damaged = says("/1 1 00 get pos"), b"@01 1 00 OK IDLE -- 192000:00\r\n"
     link = plug(*script.dialogue(question, damaged, question, damaged))
     with pytest.raises(BadChecksum, match=r"theta_r on /dev/.*reading the position") as caught:
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).state()
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).state()
     assert caught.value.raw == damaged[:-2]
     assert caught.value.sent == question
 
@@ -420,13 +420,13 @@ def test_an_answer_damaged_in_its_address_is_still_called_damaged(plug: Any, scr
     question, damaged = says("/1 1 00 get pos"), b"@11 1 00 OK IDLE -- 192000:4C\r\n"
     link = plug(*script.dialogue(question, damaged, question, damaged), timeout_s=SHORT_S)
     with pytest.raises(BadChecksum, match="theta_r"):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).state()
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).state()
 
 
 def test_without_checksums(plug: Any, script: Any) -> None:
     link = plug(*script.dialogue(b"/1 1 00 get pos\n", b"@01 1 00 OK IDLE -- 192000\r\n"))
-    stage = ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE, checksums=False)
-    assert stage.state().position_deg == 45
+    stage = ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE, checksums=False)
+    assert stage.state().position == 45
 
 
 def test_two_axes_share_a_link(plug: Any, script: Any) -> None:
@@ -438,9 +438,9 @@ def test_two_axes_share_a_link(plug: Any, script: Any) -> None:
 
     each = 40
     link = plug(script.serve(2 * each, answer))
-    axes = [ZaberAxis(link, f"axis {address}", address=address, microsteps_per_degree=1) for address in (1, 2)]
+    axes = [ZaberAxis(link, f"axis {address}", address=address, microsteps_per_unit=1) for address in (1, 2)]
     with ThreadPoolExecutor(2) as pool:
-        seen = list(pool.map(lambda stage: {stage.state().position_deg for _ in range(each)}, axes))
+        seen = list(pool.map(lambda stage: {stage.state().position for _ in range(each)}, axes))
     assert seen == [{1000.0}, {2000.0}]
 
 
@@ -459,14 +459,14 @@ def test_stop_overtakes_a_blocked_exchange(plug: Any, script: Any) -> None:
         script.send(answers("@01 1 01 OK BUSY -- 0")),
         script.send(answers("@01 1 00 OK BUSY -- 192000")),
     )
-    one = ZaberAxis(link, "theta_i", address=1, microsteps_per_degree=SCALE)
-    two = ZaberAxis(link, "theta_r", address=2, microsteps_per_degree=SCALE)
+    one = ZaberAxis(link, "theta_i", address=1, microsteps_per_unit=SCALE)
+    two = ZaberAxis(link, "theta_r", address=2, microsteps_per_unit=SCALE)
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(one.state)
         assert blocked.wait(5)
         two.stop()
         one.stop()
-        assert waiting.result().position_deg == 45
+        assert waiting.result().position == 45
 
 
 def test_a_hundred_stops_do_not_answer_the_question_they_overtake(plug: Any, script: Any) -> None:
@@ -476,13 +476,13 @@ def test_a_hundred_stops_do_not_answer_the_question_they_overtake(plug: Any, scr
     stops = [line for number in ids for line in (f"/1 1 {number:02d} stop", f"@01 1 {number:02d} OK IDLE -- 0")]
     question, answer = script.expect(says("/1 1 00 get pos")), script.send(answers("@01 1 00 OK IDLE -- 192000"))
     link = plug(question, script.tell(blocked), *talk(script, *stops), answer)
-    stage = ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE)
+    stage = ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE)
     with ThreadPoolExecutor(1) as pool:
         waiting = pool.submit(stage.state)
         assert blocked.wait(5)
         for _ in ids:
             stage.stop()
-        assert waiting.result().position_deg == 45
+        assert waiting.result().position == 45
 
 
 def test_a_move_that_has_not_gone_out_is_dropped_by_a_stop(plug: Any, script: Any) -> None:
@@ -496,7 +496,7 @@ def test_a_move_that_has_not_gone_out_is_dropped_by_a_stop(plug: Any, script: An
         script.wait(queued),
         script.send(answers("@01 1 00 OK IDLE -- 00")),
     )
-    stage = ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE)
+    stage = ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE)
     with ThreadPoolExecutor(1) as pool:
         moving = pool.submit(stage.start_move, 45)
         assert blocked.wait(5)
@@ -521,14 +521,14 @@ def test_a_move_after_a_stop_is_a_new_move(axis: Any) -> None:
 def test_an_unacknowledged_stop_is_sent_again(plug: Any, script: Any) -> None:
     stop = says("/1 1 00 stop")
     link = plug(script.expect(stop), *script.dialogue(stop, answers("@01 1 00 OK BUSY -- 0")), timeout_s=SHORT_S)
-    ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).stop()
+    ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).stop()
 
 
 def test_a_stop_that_never_arrives_is_an_error(plug: Any, script: Any) -> None:
     stop = says("/1 1 00 stop")
     link = plug(script.expect(stop), script.expect(stop), timeout_s=SHORT_S)
     with pytest.raises(TransportTimeout, match=r"theta_r on /dev/.*stopping"):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).stop()
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).stop()
 
 
 # arriving -------------------------------------------------------------------------------------------------------------
@@ -567,30 +567,30 @@ def test_arrival_not_yet(axis: Any) -> None:
 def test_unplugged(plug: Any, script: Any) -> None:
     link = plug(script.expect(says("/1 1 00 get pos")), script.unplug())
     with pytest.raises(PortClosed, match="theta_r on /dev/"):
-        ZaberAxis(link, "theta_r", microsteps_per_degree=SCALE).state()
+        ZaberAxis(link, "theta_r", microsteps_per_unit=SCALE).state()
 
 
 def test_closed(plug: Any, script: Any) -> None:
     """Closing one device leaves the link to the other."""
     link = plug(*talk(script, "/2 1 00 get pos", "@02 1 00 OK IDLE -- 7"))
-    one = ZaberAxis(link, "theta_i", address=1, microsteps_per_degree=1)
-    two = ZaberAxis(link, "theta_r", address=2, microsteps_per_degree=1)
+    one = ZaberAxis(link, "theta_i", address=1, microsteps_per_unit=1)
+    two = ZaberAxis(link, "theta_r", address=2, microsteps_per_unit=1)
     one.close()
     one.close()
     with pytest.raises(PortClosed, match="theta_i"):
         one.state()
-    assert two.state().position_deg == 7
+    assert two.state().position == 7
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        {"microsteps_per_degree": 0.0},
-        {"microsteps_per_degree": math.nan},
-        {"microsteps_per_degree": 1.0, "address": 0},
-        {"microsteps_per_degree": 1.0, "address": 100},
-        {"microsteps_per_degree": 1.0, "axis": 0},
-        {"microsteps_per_degree": 1.0, "acceleration_unit": -1.0},
+        {"microsteps_per_unit": 0.0},
+        {"microsteps_per_unit": math.nan},
+        {"microsteps_per_unit": 1.0, "address": 0},
+        {"microsteps_per_unit": 1.0, "address": 100},
+        {"microsteps_per_unit": 1.0, "axis": 0},
+        {"microsteps_per_unit": 1.0, "acceleration_unit": -1.0},
     ],
 )
 def test_nonsense_options(plug: Any, options: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from rig.kinematics import AxisMap
 def test_the_template_is_a_valid_bench() -> None:
     config = parse_config(template(), "rig.toml")
     assert not config.simulated
-    assert config.axes["detector"].limits_deg == (-85.0, 85.0)
+    assert config.axes["detector"].limits == (-85.0, 85.0)
     assert config.axes["detector"].options == {"address": 2}
     assert config.sensor.options == {"line_frequency_hz": 50}
 

@@ -1,6 +1,7 @@
 """The devices as bluesky sees them, over the simulated instruments' wires."""
 
 import threading
+from collections.abc import Callable
 
 import pytest
 from bluesky import protocols
@@ -43,13 +44,24 @@ def test_a_move_arrives(bench: Bench) -> None:
     assert detector.read()["theta_r"]["value"] == pytest.approx(-37.5, abs=0.001)
 
 
-def test_both_axes_of_one_port_move_at_once(bench: Bench) -> None:
-    moves = {name: axis.set(theta) for (name, axis), theta in zip(bench.axes.items(), (10.0, -80.0), strict=True)}
-    seen_together = False
-    while not all(move.done for move in moves.values()):
-        states = [axis.driver.state().moving for axis in bench.axes.values()]
-        seen_together = seen_together or all(states)
-    assert seen_together
+def test_both_axes_of_one_port_move_at_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+
+    def noted(start: Callable[[float], None]) -> Callable[[float], None]:
+        def begin(position: float) -> None:
+            start(position)
+            order.append("started")
+
+        return begin
+
+    for axis in bench.axes.values():
+        monkeypatch.setattr(axis.driver, "start_move", noted(axis.driver.start_move))
+    moves = [axis.set(theta) for axis, theta in zip(bench.axes.values(), (10.0, -80.0), strict=True)]
+    for move in moves:
+        move.add_callback(lambda _: order.append("done"))
+    for move in moves:
+        move.wait(10)
+    assert order == ["started", "started", "done", "done"]
 
 
 @pytest.mark.parametrize(
@@ -63,7 +75,7 @@ def test_what_is_not_allowed_is_refused_before_anything_moves(bench: Bench, axis
     with pytest.raises((InterlockError, ValueError)):
         bench.axes[axis].set(theta)
     after = bench.axes[axis].driver.state()
-    assert (after.position_deg, after.moving) == (before.position_deg, False)
+    assert (after.position, after.moving) == (before.position, False)
 
 
 def test_a_stop_that_was_asked_for_ends_the_move_well_and_short(bench: Bench) -> None:

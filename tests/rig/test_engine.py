@@ -101,7 +101,7 @@ def test_a_pause_and_going_on_leaves_a_complete_run(bench: Bench, tmp_path: Path
         detector = bench.axes["detector"].driver
         while detector.state().moving:  # it was told to stop, and slows down
             pass
-        asked.append(detector.state().position_deg)
+        asked.append(detector.state().position)
         return True
 
     views = tuple(float(v) for v in range(-60, 31, 10))
