@@ -1,23 +1,33 @@
-"""The bench: links, workers and devices made from a configuration, closed and stopped together."""
+"""The bench: devices made from a configuration, interlocked, closed and stopped together."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from drivers import catalogue
 from drivers.errors import DeviceError
-from drivers.kinds import LightSensor, Stage
-from drivers.link import Link
-from rig.bus import BusWorker
+from drivers.incidents import Report
+from drivers.kinds import LightSensor, RangeFinder, Stage
+from rig.axisrecord import AxisRecords
 from rig.clock import Clock
-from rig.config import ANGLES, AxisConfig, BenchConfig
-from rig.devices import Axis, LightMeter
+from rig.config import ANGLES, MAIN_SENSOR, AxisConfig, BenchConfig, SensorConfig
+from rig.devices import Axis, LightMeter, Ranger
 from rig.errors import ConfigError
-from rig.interlock import Interlock
-from rig.simulation import simulated_bench
+from rig.ports import Ports, open_ports
+from rig.trace import Trace
 
-LINK_TIMEOUT_S = 1.0
+READING = "current"
+"""What events call the reading of the main sensor."""
+
+
+@dataclass(frozen=True)
+class Paperwork:
+    """What is written while a bench is open: all bytes, what was done about trouble, what each axis was told. All may be left out."""
+
+    trace: Trace | None = None
+    report: Report | None = None
+    records: AxisRecords | None = None
 
 
 @dataclass(frozen=True)
@@ -28,41 +38,76 @@ class Bench:
     ----------
     config : BenchConfig
     axes : mapping of axis name to Axis
-    meter : LightMeter
+    sensors : mapping of sensor name to LightMeter or Ranger
     simulation : mapping or None
         What the simulated bench was started with (its seed, say); None on a real one.
     """
 
     config: BenchConfig
-    axes: Mapping[str, Axis]
-    meter: LightMeter
     clock: Clock
     simulation: Mapping[str, Any] | None
+    axes: dict[str, Axis] = field(default_factory=dict)
+    sensors: dict[str, LightMeter | Ranger] = field(default_factory=dict)
+
+    @property
+    def meter(self) -> LightMeter:
+        """The light sensor that a sweep reads."""
+        meter = self.sensors[MAIN_SENSOR]
+        assert isinstance(meter, LightMeter)
+        return meter
+
+    @property
+    def monitors(self) -> tuple[LightMeter | Ranger, ...]:
+        """The sensors that are read along with it."""
+        return tuple(sensor for name, sensor in self.sensors.items() if self.config.sensors[name].monitor)
+
+    @property
+    def notices(self) -> list[str]:
+        """What somebody should know before anything moves."""
+        return [notice for axis in self.axes.values() for notice in axis.notices]
 
     def stop(self) -> list[DeviceError]:
-        """Stop every axis at once; return what could not be told to stop. Safe from any thread."""
-        failures = []
-        for axis in self.axes.values():
-            try:
-                axis.stop()
-            except DeviceError as exc:
-                failures.append(exc)
-        return failures
+        """Stop every axis at once; return what could not be told to stop. Safe from any thread.
+
+        No axis waits for another's answer: a silent wire must not delay the stop on the next one.
+        """
+        if not self.axes:
+            return []
+        with ThreadPoolExecutor(len(self.axes), thread_name_prefix="stop") as pool:
+            return [failure for failure in pool.map(_stop, self.axes.values()) if failure is not None]
 
     def position(self) -> dict[str, float]:
-        """Return where each axis stands or is going, in degrees of theta."""
+        """Return where each axis stands or is going, in theta."""
         return {name: axis.destination for name, axis in self.axes.items()}
 
 
+def _stop(axis: Axis) -> DeviceError | None:
+    try:
+        axis.stop()
+    except DeviceError as exc:
+        return exc
+    return None
+
+
 @contextmanager
-def open_bench(config: BenchConfig, specimen: str) -> Iterator[Bench]:
-    """Open every instrument of `config`; leave them stopped and closed, whatever happens inside.
+def open_bench(
+    config: BenchConfig,
+    specimen: str,
+    *,
+    axes: Iterable[str] | None = None,
+    sensors: Iterable[str] | None = None,
+    paperwork: Paperwork | None = None,
+) -> Iterator[Bench]:
+    """Open instruments of `config`; leave them stopped and closed, whatever happens inside.
 
     Parameters
     ----------
     config : BenchConfig
     specimen : str
         The cultivar that is mounted; the simulated bench mounts it itself.
+    axes, sensors : iterable of str, optional
+        Which ones; by default the two arms, and the main sensor with its monitors.
+    paperwork : Paperwork, optional
 
     Raises
     ------
@@ -71,57 +116,69 @@ def open_bench(config: BenchConfig, specimen: str) -> Iterator[Bench]:
     ConfigError
         Where the simulated bench lacks the specimen.
     """
+    paperwork = paperwork or Paperwork()
+    chosen = tuple(ANGLES) if axes is None else tuple(axes)
+    wanted = [name for name, each in config.sensors.items() if each.monitor or name == MAIN_SENSOR] if sensors is None else list(sensors)
     with ExitStack() as stack:
-        simulated = stack.enter_context(simulated_bench(config, specimen)) if config.simulated else None
-        clock = Clock(config.simulation.speed if config.simulation else 1.0)
-        models = catalogue.load()
-        links: dict[str, tuple[Link, BusWorker]] = {}
-
-        def connect(model: str, port: str, serial: Mapping[str, Any]) -> tuple[Link, BusWorker]:
-            if port not in links:
-                url = simulated.url(port) if simulated else port
-                link = models.lookup(model).open_link(url, timeout_s=LINK_TIMEOUT_S, **serial)
-                stack.callback(link.close)
-                worker = BusWorker(port, clock)
-                stack.callback(worker.close)
-                links[port] = (link, worker)
-            return links[port]
-
-        sensor = config.sensor
-        meter_link, meter_worker = connect(sensor.model, sensor.port, sensor.serial)
-        stage_links = {name: connect(axis.model, axis.port, axis.serial) for name, axis in config.axes.items()}
-        meter_driver = models.lookup(sensor.model).open_device(meter_link, name="meter", **sensor.options)
-        if not isinstance(meter_driver, LightSensor):
-            raise ConfigError(f"{config.source}: sensor.model: {sensor.model} is not a light sensor")
-        meter_driver.configure(sensor.integration_s, sensor.range)
-        axes: dict[str, Axis] = {}
-        meter = LightMeter("current", meter_driver, meter_worker)
-        bench = Bench(config, axes, meter, clock, simulated.parameters if simulated else None)
-        stack.callback(bench.stop)
-        for name, axis in config.axes.items():
-            link, worker = stage_links[name]
-            stage = models.lookup(axis.model).open_device(link, name=name, **axis.options)
-            if not isinstance(stage, Stage):
-                raise ConfigError(f"{config.source}: axes.{name}.model: {axis.model} is not a rotary axis")
-            stage.set_profile(speed=axis.speed, acceleration=axis.acceleration)
-            axes[name] = _axis(axis, stage, bench, worker)
+        ports = stack.enter_context(open_ports(config, specimen, trace=paperwork.trace, report=paperwork.report))
+        bench = Bench(config, ports.clock, ports.simulation)
+        for name in (*wanted, *chosen):  # a port that cannot be opened is found before any instrument is set
+            ports.on(config.devices[name])
+        for name in wanted:
+            bench.sensors[name] = _sensor(ports, config.sensors[name])
+        stack.push(lambda kind, exc, trace: _leave_stopped(bench, exc))
+        for name in chosen:
+            bench.axes[name] = _axis(ports, config.axes[name], bench, paperwork)
         yield bench
 
 
-def _axis(config: AxisConfig, stage: Stage, bench: Bench, worker: BusWorker) -> Axis:
-    interlock: Interlock = bench.config.interlock
+def _leave_stopped(bench: Bench, exc: BaseException | None) -> None:
+    failures = bench.stop()
+    if not failures:
+        return
+    warning = f"AND NOT EVERY AXIS COULD BE STOPPED, it may still be moving: {'; '.join(map(str, failures))}"
+    if exc is None:
+        failures[0].hint = warning
+        raise failures[0]
+    if isinstance(exc, DeviceError):
+        exc.hint = f"{exc.hint}; {warning}" if exc.hint else warning
+    else:
+        exc.add_note(warning)
 
-    def check(axis: str, target_deg: float) -> None:
-        interlock.check_move(bench.position(), axis, target_deg)
+
+def _sensor(ports: Ports, config: SensorConfig) -> LightMeter | Ranger:
+    driver, worker = ports.open(config)
+    name = READING if config.name == MAIN_SENSOR else config.name
+    if isinstance(driver, LightSensor):
+        assert config.integration_s is not None
+        driver.configure(config.integration_s, config.range)
+        return LightMeter(name, driver, worker)
+    if isinstance(driver, RangeFinder):
+        return Ranger(name, driver, worker)
+    raise ConfigError(f"{ports.config.source}: {config.name}: {config.model} is no sensor")
+
+
+def _axis(ports: Ports, config: AxisConfig, bench: Bench, paperwork: Paperwork) -> Axis:
+    stage, worker = ports.open(config)
+    if not isinstance(stage, Stage):
+        raise ConfigError(f"{ports.config.source}: axes.{config.name}.model: {config.model} is not a stage")
+    stage.set_profile(speed=config.speed, acceleration=config.acceleration)
+    interlock = ports.config.interlock
+
+    def check(axis: str, target: float) -> None:
+        interlock.check_move(bench.position(), axis, target)
 
     return Axis(
         config.name,
-        ANGLES[config.name],
+        ANGLES.get(config.name, config.name),
         stage,
         config.map,
         worker,
-        bench.clock,
+        ports.clock,
         settle_s=config.settle_s,
         tolerance=config.tolerance,
+        limits=config.limits,
         check=check,
+        memory=paperwork.records.of(config.identity) if paperwork.records else None,
+        report=paperwork.report,
     )

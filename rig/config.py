@@ -2,30 +2,39 @@
 
 import hashlib
 import importlib.resources
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rig.errors import ConfigError
 from rig.interlock import Interlock, KeepOut
 from rig.kinematics import AxisMap
 
+if TYPE_CHECKING:
+    from drivers.kinds import Unit
+
 SIMULATED_PORT = "sim:"
 """A port that starts so is an instrument of the simulated bench, by name."""
 
 ANGLES = {"source": "theta_i", "detector": "theta_r"}
-"""The axes of the bench and the angles they realise."""
+"""The arms, which every bench has, and the angles they realise. An axis of another name is known by that name."""
+
+MAIN_SENSOR = "sensor"
+"""What a sweep reads; it has a table of its own, the others are under [sensors]."""
 
 
 @dataclass(frozen=True)
 class AxisConfig:
-    """One axis: which stage, where it hangs, how its angle counts, where it may go (degrees, seconds)."""
+    """One axis: which stage, where it hangs, how its angle counts, where it may go (degrees, or mm of a linear one; seconds)."""
 
     name: str
     model: str
     port: str
+    unit: "Unit"
     map: AxisMap
     limits: tuple[float, float]
     speed: float | None
@@ -35,25 +44,39 @@ class AxisConfig:
     options: Mapping[str, Any]
     serial: Mapping[str, Any]
 
+    @property
+    def identity(self) -> str:
+        """Which stage this is, whatever it is called: port, model and what tells it from the others there."""
+        return " ".join([self.port, self.model, *(f"{key}={self.options[key]}" for key in ("address", "axis") if key in self.options)])
+
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """The light sensor: which one, where it hangs, how long it looks (seconds), its full scale (its unit; None: it chooses)."""
+    """A sensor: which one, where it hangs, how long it looks (seconds), its full scale (its unit; None: it chooses).
 
+    A range finder has neither of the last two. A `monitor` is read along with every point of a sweep.
+    """
+
+    name: str
     model: str
     port: str
-    integration_s: float
+    integration_s: float | None
     range: float | None
+    monitor: bool
     options: Mapping[str, Any]
     serial: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """How the simulated bench runs: times faster than time, and its seed (None: a fresh one each time)."""
+    """How the simulated bench runs: times faster than time, and its seed (None: a fresh one each time).
+
+    Where it is `served` it runs already (`rig sim serve`), and ports are its addresses.
+    """
 
     speed: float
     seed: int | None
+    served: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,7 +85,7 @@ class BenchConfig:
 
     name: str
     axes: Mapping[str, AxisConfig]
-    sensor: SensorConfig
+    sensors: Mapping[str, SensorConfig]
     keep_out: KeepOut
     simulation: Simulation | None
     text: str = field(repr=False)
@@ -74,9 +97,20 @@ class BenchConfig:
         return self.simulation is not None
 
     @property
+    def sensor(self) -> SensorConfig:
+        """The light sensor that a sweep reads."""
+        return self.sensors[MAIN_SENSOR]
+
+    @property
+    def devices(self) -> dict[str, AxisConfig | SensorConfig]:
+        """All instruments, by name."""
+        return {**self.axes, **self.sensors}
+
+    @property
     def interlock(self) -> Interlock:
         """Limits and keep-out."""
-        return Interlock({name: axis.limits for name, axis in self.axes.items()}, self.keep_out)
+        limits = {name: axis.limits for name, axis in self.axes.items()}
+        return Interlock(limits, self.keep_out, units={name: axis.unit for name, axis in self.axes.items()})
 
     @property
     def sha256(self) -> str:
@@ -126,12 +160,17 @@ def parse_config(text: str, source: str) -> BenchConfig:
     bench.done()
     simulation = _simulation(top.table("simulation")) if "simulation" in document else None
     axes = top.table("axes")
-    axis_configs = {axis: _axis(axis, axes.table(axis)) for axis in ANGLES}
-    axes.done()
+    axis_configs = {axis: _axis(axis, axes.table(axis)) for axis in (*ANGLES, *axes.names(but=ANGLES))}
+    sensors = {MAIN_SENSOR: _sensor(MAIN_SENSOR, top.table("sensor"))}
+    others = top.table("sensors", required=False)
+    for sensor in others.names():
+        if sensor in (MAIN_SENSOR, *axis_configs):
+            raise others.error(sensor, "this name is taken")
+        sensors[sensor] = _sensor(sensor, others.table(sensor))
     config = BenchConfig(
         name=name,
         axes=axis_configs,
-        sensor=_sensor(top.table("sensor")),
+        sensors=sensors,
         keep_out=_keep_out(top.table("keep_out")),
         simulation=simulation,
         text=text,
@@ -143,10 +182,12 @@ def parse_config(text: str, source: str) -> BenchConfig:
 
 
 def _axis(name: str, table: "_Table") -> AxisConfig:
-    model, options, serial = _device(table, "rotary-axis", frozenset({"speed", "acceleration"}))
-    low, high = table.pair("limits")
+    kinds = ("rotary-axis",) if name in ANGLES else ("rotary-axis", "linear-axis")
+    model, kind, options, serial = _device(table, kinds, frozenset({"speed", "acceleration"}))
+    unit: Unit = "mm" if kind == "linear-axis" else "deg"
+    low, high = table.pair("limits", unit)
     if low >= high:
-        raise table.error("limits", f"[{low:g}, {high:g}] are swapped: give [lowest, highest] in degrees")
+        raise table.error("limits", f"[{low:g}, {high:g}] are swapped: give [lowest, highest] in {unit}")
     sign = table.number("sign", default=1)
     if sign not in (1, -1):
         raise table.error("sign", f"{sign:g} may be 1 or -1")
@@ -154,6 +195,7 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
         name=name,
         model=model,
         port=table.text("port"),
+        unit=unit,
         map=AxisMap(int(sign), table.number("offset", default=0.0)),
         limits=(low, high),
         speed=table.positive("speed", default=None),
@@ -167,17 +209,28 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
     return config
 
 
-def _sensor(table: "_Table") -> SensorConfig:
-    model, options, serial = _device(table, "light-sensor", frozenset({"integration_s", "range"}))
-    integration = table.positive("integration", default=0.1)
-    assert integration is not None
-    config = SensorConfig(model, table.text("port"), integration, table.positive("range", default=None), options, serial)
+def _sensor(name: str, table: "_Table") -> SensorConfig:
+    main = name == MAIN_SENSOR
+    kinds = ("light-sensor",) if main else ("light-sensor", "range-finder")
+    model, kind, options, serial = _device(table, kinds, frozenset({"integration_s", "range"}))
+    light = kind == "light-sensor"
+    config = SensorConfig(
+        name=name,
+        model=model,
+        port=table.text("port"),
+        integration_s=table.positive("integration", default=0.1) if light else None,
+        range=table.positive("range", default=None) if light else None,
+        monitor=light and not main and table.flag("monitor", default=False),
+        options=options,
+        serial=serial,
+    )
     table.done()
     return config
 
 
 def _keep_out(table: "_Table") -> KeepOut:
-    zone = KeepOut(table.number("within", low=0.0, high=90.0), table.flag("crossing"))
+    within = table.number("within", low=0.0, high=90.0)
+    zone = KeepOut(within, table.flag("crossing"), table.number("shadow", default=within, low=0.0, high=90.0))
     table.done()
     return zone
 
@@ -186,21 +239,22 @@ def _simulation(table: "_Table") -> Simulation:
     speed = table.positive("speed", default=1.0)
     assert speed is not None
     seed = table.number("seed", default=None, low=0)
+    simulation = Simulation(speed, None if seed is None else int(seed), table.flag("served", default=False))
     table.done()
-    return Simulation(speed, None if seed is None else int(seed))
+    return simulation
 
 
-def _device(table: "_Table", kind: str, owned: frozenset[str]) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Return model, the model's own options and the line settings that `table` gives; `owned` options have keys of ours."""
+def _device(table: "_Table", kinds: tuple[str, ...], owned: frozenset[str]) -> tuple[str, str, dict[str, Any], dict[str, Any]]:
+    """Return model, its kind, its own options and the line settings that `table` gives; `owned` options have keys of ours."""
     from drivers import catalogue
     from drivers.errors import InvalidSetting
 
     models = catalogue.load()
-    known = sorted(name for name, model in models.models.items() if model.kind == kind)
+    known = sorted(name for name, model in models.models.items() if model.kind in kinds)
     name = table.text("model")
     if name not in known:
         problems = "".join(f"; {problem}" for problem in models.problems)
-        raise table.error("model", f"unknown model {name!r}; a {kind} may be {', '.join(known)}{problems}")
+        raise table.error("model", f"unknown model {name!r}; a {' or '.join(kinds)} may be {', '.join(known)}{problems}")
     model = models.models[name]
     options: dict[str, Any] = {}
     for key, option in model.options.items():
@@ -216,21 +270,36 @@ def _device(table: "_Table", kind: str, owned: frozenset[str]) -> tuple[str, dic
             line[key] = table.value(key)
             if type(line[key]) is not type(default):
                 raise table.error(key, f"{line[key]!r} must be like {default!r}, the setting as delivered")
-    return name, options, line
+    return name, model.kind, options, line
 
 
 def _check_ports(config: BenchConfig) -> None:
-    for key, port in [(f"axes.{a.name}.port", a.port) for a in config.axes.values()] + [("sensor.port", config.sensor.port)]:
-        if port.startswith(SIMULATED_PORT) is not config.simulated:
-            what = (
-                f"{SIMULATED_PORT}NAME, since [simulation] is there"
-                if config.simulated
-                else "a port; [simulation] is missing for sim: ports"
-            )
-            raise ConfigError(f"{config.source}: {key}: {port!r} must be {what}")
-    source, detector = config.axes.values()
-    if source.port == detector.port and source.options == detector.options:
-        raise ConfigError(f"{config.source}: axes.detector.address: the same stage as axes.source; give each its own address or port")
+    keys = {**{name: f"axes.{name}" for name in config.axes}, **{name: f"sensors.{name}" for name in config.sensors}, MAIN_SENSOR: "sensor"}
+    simulation = config.simulation
+    started = simulation is not None and not simulation.served
+    for name, device in config.devices.items():
+        if device.port.startswith(SIMULATED_PORT) is not started:
+            if started:
+                what = f"{SIMULATED_PORT}NAME, since [simulation] is there"
+            else:
+                what = f"a port; only a [simulation] that is not served has {SIMULATED_PORT} ports"
+            raise ConfigError(f"{config.source}: {keys[name]}.port: {device.port!r} must be {what}")
+    for first, second in combinations(config.devices.values(), 2):
+        if first.port == second.port:
+            _check_neighbours(f"{config.source}: {keys[second.name]}", keys[first.name], second, first)
+
+
+def _check_neighbours(where: str, first: str, device: AxisConfig | SensorConfig, other: AxisConfig | SensorConfig) -> None:
+    """Raise ConfigError where two devices cannot share the port they name."""
+    from drivers import catalogue
+
+    models = catalogue.load()
+    one, two = (models.lookup(each.model) for each in (other, device))
+    if one.open_port is not two.open_port or {**one.line, **other.serial} != {**two.line, **device.serial}:
+        raise ConfigError(f"{where}.port: {device.port!r} is the port of {first}, whose line settings or protocol are others")
+    if type(device) is type(other) and device.model == other.model and device.options == other.options:
+        key = "axis" if "axis" in two.options and "address" not in device.options else "address"
+        raise ConfigError(f"{where}.{key}: the same instrument as {first}; give each its own address, axis or port")
 
 
 class _Table:
@@ -286,17 +355,26 @@ class _Table:
             raise self.error(key, f"{value!r} must be a number above 0")
         return None if value is None else float(value)
 
-    def flag(self, key: str) -> bool:
-        value = self._get(key, _REQUIRED, "true or false")
+    def flag(self, key: str, *, default: bool | None = None) -> bool:
+        value = self._get(key, _REQUIRED if default is None else default, "true or false")
         if not isinstance(value, bool):
             raise self.error(key, f"{value!r} may be true or false")
         return value
 
-    def pair(self, key: str) -> tuple[float, float]:
+    def pair(self, key: str, unit: str) -> tuple[float, float]:
         value = self._get(key, _REQUIRED, "[lowest, highest]")
-        if not isinstance(value, list) or len(value) != 2 or not all(type(v) in (int, float) and abs(v) <= 360 for v in value):
-            raise self.error(key, f"{value!r} must be [lowest, highest] in degrees")
+        most = 360 if unit == "deg" else 10_000
+        if not isinstance(value, list) or len(value) != 2 or not all(type(v) in (int, float) and abs(v) <= most for v in value):
+            raise self.error(key, f"{value!r} must be [lowest, highest] in {unit}, within {most:g}")
         return float(value[0]), float(value[1])
+
+    def names(self, *, but: Iterable[str] = ()) -> list[str]:
+        """Return the names of the tables in here, in their order; all that stands here must be one, with a name of small letters."""
+        found = [key for key in self._values if key not in but]
+        for key in found:
+            if not re.fullmatch(r"[a-z][a-z0-9_]*", key):
+                raise self.error(key, "a name is made of small letters, digits and _")
+        return found
 
     def offers(self, key: str) -> bool:
         """Take note that `key` may stand here, and tell whether it does."""

@@ -6,11 +6,14 @@ What each owes the engine: https://blueskyproject.io/bluesky/main/hardware.html
 import math
 import threading
 import time
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from drivers.errors import DeviceFault, MoveTimeout, NotHomed, UnexpectedReply
-from drivers.kinds import LightReading, LightSensor, Stage
+from drivers.errors import BadChecksum, DeviceError, DeviceFault, MoveTimeout, NotHomed, TransportTimeout, UnexpectedReply
+from drivers.incidents import Incident, Report, What
+from drivers.kinds import AxisState, DistanceReading, ForgetfulStage, LightReading, LightSensor, RangeFinder, Stage
+from rig.axisrecord import AxisMemory, AxisRecord
 from rig.bus import BusWorker, Task
 from rig.clock import Clock
 from rig.errors import InterlockError
@@ -18,7 +21,13 @@ from rig.kinematics import AxisMap
 from rig.status import Status
 
 POLL_S = 0.004
-"""How often an axis that should have arrived is asked again."""
+"""How often an axis that should have arrived is asked again, s of real time."""
+
+WATCH_S = 0.05
+"""How often an axis on its way is looked at, s of real time."""
+
+ASTRAY = 0.5
+"""How far beside its way an axis may be seen, in its unit, before it is stopped."""
 
 OUT_OF_RANGE = 9.9e37
 """Stands for a value beyond the sensor's range, as in SCPI: JSON has no infinity. Such a reading is never good."""
@@ -58,14 +67,14 @@ class Configured:
 
 
 class Axis(Configured):
-    """A positioner in degrees of theta: Movable, Locatable, Stoppable, Readable and Checkable.
+    """A positioner in degrees of theta, or in mm: Movable, Locatable, Stoppable, Readable and Checkable.
 
     Parameters
     ----------
     name : str
         The axis, e.g. `detector`.
     angle : str
-        The angle it realises, e.g. `theta_r`; its readback carries this name in every event.
+        What it realises, e.g. the angle `theta_r`; its readback carries this name in every event.
     driver : Stage
     axis_map : AxisMap
     bus : BusWorker
@@ -75,8 +84,19 @@ class Axis(Configured):
         How long the arm rings after the stage has arrived.
     tolerance : float
         How far from its target a stage that has arrived may stand.
+    limits : pair of float
+        Where it may be seen, in theta.
     check : callable
         `check(axis name, theta_deg)` raises InterlockError where the axis may not go.
+    memory : AxisMemory, optional
+        Where each command is written down before it is sent.
+    report : callable, optional
+        Told what was done about a motion whose start was in doubt.
+
+    Attributes
+    ----------
+    notices : tuple of str
+        What somebody should know before the axis moves: it is not where it was left, or was on its way when a program ended.
     """
 
     kind = "axis"
@@ -92,7 +112,10 @@ class Axis(Configured):
         *,
         settle_s: float,
         tolerance: float,
+        limits: tuple[float, float],
         check: Callable[[str, float], None],
+        memory: AxisMemory | None = None,
+        report: Report | None = None,
     ) -> None:
         self.name = name
         self.angle = angle
@@ -100,10 +123,13 @@ class Axis(Configured):
         self.map = axis_map
         self.settle_s = settle_s
         self.tolerance = tolerance
+        self.limits = limits
         self.homing = Homing(self)
         self._bus = bus
         self._clock = clock
         self._check = check
+        self._memory = memory
+        self._report = report or (lambda incident: None)
         self._profile = driver.profile()
         self._identity = driver.identify()
         self._moving: Status | None = None
@@ -111,6 +137,7 @@ class Axis(Configured):
         self._setpoint = math.nan
         self._readback = math.nan
         self._homed = False
+        self.notices = self._recollect()
         self.refresh()
 
     # -- what it knows -------------------------------------------------------------------------------------------------
@@ -122,7 +149,7 @@ class Axis(Configured):
 
     @property
     def position(self) -> float:
-        """The last readback in degrees of theta."""
+        """The last readback in theta."""
         return self._readback
 
     @property
@@ -130,11 +157,43 @@ class Axis(Configured):
         """Where the axis is going, or else stands, in degrees of theta."""
         return self._setpoint if self._moving is not None and not self._moving.done else self._readback
 
-    def refresh(self) -> None:
+    @property
+    def unit(self) -> str:
+        """Degrees or millimetres."""
+        return self.driver.unit
+
+    @property
+    def last_command(self) -> AxisRecord | None:
+        """What was written down of the stage last, as the stage counts."""
+        return self._memory.get() if self._memory is not None else None
+
+    def refresh(self) -> AxisState:
         """Ask the stage where it stands."""
         state = self.driver.state()
         self._homed = state.homed
         self._readback = self.map.to_theta(state.position)
+        return state
+
+    def _recollect(self) -> tuple[str, ...]:
+        """Compare the stage with what was written down of it last."""
+        record = self.last_command
+        if record is None:
+            return ()
+        state = self.driver.state()
+        here, unit = self._theta_text(state.position), self.unit
+        if record.under_way:
+            aim = "homing" if record.setpoint is None else f"on its way to {self._theta_text(record.setpoint)} {unit}"
+            return (f"{self.name} was {aim} when the last program that moved it ended without seeing the end; it is at {here} {unit} now",)
+        left = self._theta_text(record.readback)
+        if abs(state.position - record.readback) > self.tolerance:
+            return (f"{self.name} was left at {left} {unit} and is at {here} {unit}: switched off, or moved by somebody else; home it",)
+        # A counter that was switched off reads 0, wherever the arm stands: at 0 nothing tells the two apart.
+        if isinstance(self.driver, ForgetfulStage) and not state.homed and record.homed and abs(state.position) > self.tolerance:
+            self.driver.trust_reference()
+        return ()
+
+    def _theta_text(self, position: float) -> str:
+        return f"{self.map.to_theta(position):.3f}"
 
     def travel_s(self, from_deg: float, to_deg: float) -> float:
         """Return the bench seconds a move takes, settling included."""
@@ -151,7 +210,7 @@ class Axis(Configured):
     def check_value(self, value: float) -> None:
         """Raise InterlockError where the axis may not go to `value` (degrees)."""
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise InterlockError(f"axis {self.name}: expected an angle in degrees, got {value!r}; nothing was moved")
+            raise InterlockError(f"axis {self.name}: expected a number in {self.unit}, got {value!r}; nothing was moved")
         self._check(self.name, float(value))
 
     def set(self, value: float) -> Status:
@@ -189,18 +248,19 @@ class Axis(Configured):
 
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return type, unit and source of what `read` gives."""
-        key = {"source": f"axis:{self.name}", "dtype": "number", "shape": [], "units": "degree"}
+        units = "degree" if self.unit == "deg" else self.unit
+        key = {"source": f"axis:{self.name}", "dtype": "number", "shape": [], "units": units}
         return {self.angle: dict(key), f"{self.angle}_setpoint": dict(key)}
 
     def _configuration(self) -> dict[str, Any]:
         return {
             **vars(self._identity),
             "sign": self.map.sign,
-            "offset_deg": self.map.offset_deg,
-            "speed": self._profile.speed,
-            "acceleration": self._profile.acceleration,
+            f"offset_{self.unit}": self.map.offset_deg,
+            f"speed_{self.unit}_s": self._profile.speed,
+            f"acceleration_{self.unit}_s2": self._profile.acceleration,
             "settle_s": self.settle_s,
-            "tolerance": self.tolerance,
+            f"tolerance_{self.unit}": self.tolerance,
         }
 
     # -- motion --------------------------------------------------------------------------------------------------------
@@ -213,37 +273,57 @@ class Axis(Configured):
         return self._moving
 
     def _move(self, target: float, stopped: threading.Event) -> Task:
-        axis_deg = self.map.to_axis(target)
-        state = self.driver.state()
-        self._readback = self.map.to_theta(state.position)
+        goal = self.map.to_axis(target)
+        state = self.refresh()
         if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance:
             return
         duration = self._profile.duration_s(abs(self._readback - target))
-        if not self._started(lambda: self.driver.start_move(axis_deg), stopped):
+        if not self._started(lambda: self.driver.start_move(goal), goal, state, stopped):
             return
-        yield from self._until_idle(f"the move to {target:g} deg", duration, stopped)
+        yield from self._until_idle(f"the move to {target:g} {self.unit}", duration, stopped, way=(self._readback, target))
         if not stopped.is_set():
-            self.driver.check_arrival(axis_deg, self.tolerance)
+            self.driver.check_arrival(goal, self.tolerance)
             yield self.settle_s
-        self.refresh()
+        self._remember(goal, self.refresh(), under_way=False)
 
     def _home(self, stopped: threading.Event) -> Task:
-        if not self._started(self.driver.start_home, stopped):
+        state = self.refresh()
+        if not self._started(self.driver.start_home, None, state, stopped):
             return
-        yield from self._until_idle("homing", self._profile.duration_s(360.0), stopped, predicted=False)
+        farthest = 360.0 if self.unit == "deg" else 2 * (self.limits[1] - self.limits[0])
+        yield from self._until_idle("homing", self._profile.duration_s(farthest), stopped, way=None)
         if not stopped.is_set():
             yield self.settle_s
-        self.refresh()
+        self._remember(None, self.refresh(), under_way=False)
         if not stopped.is_set() and not self._homed:
             raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
 
-    def _started(self, start: Callable[[], None], stopped: threading.Event) -> bool:
-        """Start a motion unless a stop was asked for meanwhile; return whether it runs."""
+    def _remember(self, goal: float | None, state: AxisState, *, under_way: bool) -> None:
+        if self._memory is not None:
+            self._memory.put(setpoint=goal, readback=state.position, under_way=under_way or state.moving, homed=state.homed)
+
+    def _started(self, start: Callable[[], None], goal: float | None, before: AxisState, stopped: threading.Event) -> bool:
+        """Start a motion unless a stop was asked for meanwhile; return whether it runs.
+
+        Where no good answer comes it is unknown whether the stage took the command. It is asked for its state before anything else: if it
+        moves, or is elsewhere, the motion is followed to its end, which tells whether it was the right one; if it has not stirred, the
+        command is sent once more.
+        """
         if stopped.is_set():
             return False
+        self._remember(goal, before, under_way=True)
         try:
-            start()
+            try:
+                start()
+            except (BadChecksum, TransportTimeout, UnexpectedReply) as doubt:
+                state = self.driver.state()
+                if not (state.moving or abs(state.position - before.position) > self.tolerance or stopped.is_set()):
+                    self._tell("motion sent again", doubt)
+                    start()
+                else:
+                    self._tell("motion followed", doubt)
         except DeviceFault:
+            self._remember(goal, before, under_way=False)
             if stopped.is_set():  # the driver would not let it follow the stop
                 return False
             raise
@@ -251,24 +331,44 @@ class Axis(Configured):
             self.driver.stop()
         return True
 
-    def _until_idle(self, what: str, duration: float, stopped: threading.Event, *, predicted: bool = True) -> Task:
+    def _tell(self, what: What, doubt: DeviceError) -> None:
+        self._report(Incident(time.time(), doubt.port, self.name, doubt.attempt, what, str(doubt)))
+
+    def _until_idle(self, what: str, duration: float, stopped: threading.Event, *, way: tuple[float, float] | None) -> Task:
+        """Wait for the end of a motion: look now and then while it is under way, and often when it should be over."""
+        speed = self._clock.speed
         started = self._clock.monotonic()
-        if predicted:
-            yield from self._watch(duration, stopped)
-        while self.driver.state().moving:
-            elapsed = self._clock.monotonic() - started
+        predicted = duration if way is not None else 0.0
+        yield min(max(predicted, POLL_S * speed), WATCH_S * speed)
+        while (state := self.refresh()).moving:
+            now = self._clock.monotonic()
+            if state.waiting:
+                started = now
+            elapsed = now - started
             if elapsed > 3 * duration + 5.0:
                 self.driver.stop()
                 raise MoveTimeout(
                     "still moving; it was stopped", device=self.name, attempt=what, expected=f"{duration:.1f} s", elapsed_s=elapsed
                 )
-            yield POLL_S * self._clock.speed
+            if way is not None:
+                self._keep_to(way, self._readback, what)
+            left = 0.0 if stopped.is_set() else predicted - elapsed
+            yield min(max(left, POLL_S * speed), WATCH_S * speed)
 
-    def _watch(self, duration: float, stopped: threading.Event) -> Task:
-        """Wait out a predicted travel, yet notice within 50 ms that the axis was told to stop."""
-        end = self._clock.monotonic() + duration
-        while not stopped.is_set() and (left := end - self._clock.monotonic()) > 0:
-            yield min(left, 0.05 * self._clock.speed)
+    def _keep_to(self, way: tuple[float, float], theta: float, what: str) -> None:
+        """Stop the axis where it has left its way, or its limits: a command may have been damaged on a wire without checksums."""
+        low, high = min(way), max(way)
+        # It may have begun outside the limits, and is then on its way in.
+        low, high = max(low, min(self.limits[0], way[0])) - ASTRAY, min(high, max(self.limits[1], way[0])) + ASTRAY
+        if not low <= theta <= high:
+            self.driver.stop()
+            raise DeviceFault(
+                f"at {theta:.3f} {self.unit}, which is not on its way; it was stopped",
+                device=self.name,
+                attempt=what,
+                expected=f"{low:.3f} to {high:.3f} {self.unit}",
+                hint="check the cable, then home the axis",
+            )
 
 
 class Homing:
@@ -305,21 +405,42 @@ class Homing:
         return {}
 
 
-class LightMeter(Configured):
-    """A light sensor: Triggerable and Readable.
+R = TypeVar("R", LightReading, DistanceReading)
 
-    A reading out of the meter's range is kept as read, marked by `<name>_good = 0`, and never used as good.
+
+class Sensor(Configured, Generic[R]):
+    """A sensor in whatever unit: Triggerable and Readable.
+
+    A reading that cannot be trusted is kept as read, marked by `<name>_good = 0`, and never used as good.
     """
 
-    kind = "sensor"
+    unit: str
 
-    def __init__(self, name: str, driver: LightSensor, bus: BusWorker) -> None:
+    def __init__(self, name: str, bus: BusWorker) -> None:
         self.name = name
-        self.driver = driver
         self._bus = bus
-        self._identity = driver.identify()
-        self._last: LightReading | None = None
+        self._last: R | None = None
         self._time = math.nan
+
+    @abstractmethod
+    def _acquire(self) -> R:
+        """Take one reading."""
+
+    @abstractmethod
+    def _value(self, reading: R) -> float:
+        """Return the number a reading holds, in `unit`."""
+
+    @property
+    def last(self) -> R:
+        """What the last trigger acquired."""
+        if self._last is None:
+            raise UnexpectedReply("read before it was triggered", device=self.name)
+        return self._last
+
+    @property
+    def value(self) -> float:
+        """Its number, in `unit`."""
+        return self._value(self.last)
 
     @property
     def hints(self) -> dict[str, Any]:
@@ -328,36 +449,73 @@ class LightMeter(Configured):
 
     def trigger(self) -> Status:
         """Take one reading; the status ends when it is there."""
-        return self._bus.call(self._acquire)
+        return self._bus.call(self._take)
 
-    def _acquire(self) -> None:
+    def _take(self) -> None:
         self._last = None
-        self._last = self.driver.read()
+        self._last = self._acquire()
         self._time = time.time()
 
     def read(self) -> Reading:
         """Return what the last trigger acquired, with the time it came in."""
-        reading = self._last
-        if reading is None:
-            raise UnexpectedReply("read before it was triggered", device=self.name)
+        reading = self.last
+        value = self._value(reading)
         values = {
-            self.name: float(reading.value) if math.isfinite(reading.value) else math.copysign(OUT_OF_RANGE, reading.value),
+            self.name: float(value) if math.isfinite(value) else math.copysign(OUT_OF_RANGE, value),
             f"{self.name}_status": int(reading.status),
-            f"{self.name}_good": int(not reading.over_range and not reading.under_range),
+            f"{self.name}_good": int(reading.good),
         }
         return {key: {"value": value, "timestamp": self._time} for key, value in values.items()}
 
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return type, unit and source of what `read` gives."""
-        source = f"sensor:{self.name}"
+        source = f"{self.kind}:{self.name}"
         return {
-            self.name: {"source": source, "dtype": "number", "shape": [], "units": self.driver.unit},
+            self.name: {"source": source, "dtype": "number", "shape": [], "units": self.unit},
             f"{self.name}_status": {"source": source, "dtype": "integer", "shape": []},
             f"{self.name}_good": {"source": source, "dtype": "integer", "shape": []},
         }
 
+
+class LightMeter(Sensor[LightReading]):
+    """A light sensor."""
+
+    kind = "sensor"
+
+    def __init__(self, name: str, driver: LightSensor, bus: BusWorker) -> None:
+        super().__init__(name, bus)
+        self.driver = driver
+        self.unit = driver.unit
+        self._identity = driver.identify()
+
+    def _acquire(self) -> LightReading:
+        return self.driver.read()
+
+    def _value(self, reading: LightReading) -> float:
+        return reading.value
+
     def _configuration(self) -> dict[str, Any]:
-        return {
-            **vars(self._identity),
-            "integration_s": self.driver.integration_s,
-        }
+        return {**vars(self._identity), "integration_s": self.driver.integration_s}
+
+
+class Ranger(Sensor[DistanceReading]):
+    """A range finder."""
+
+    kind = "range-finder"
+    unit = "mm"
+
+    def __init__(self, name: str, driver: RangeFinder, bus: BusWorker) -> None:
+        super().__init__(name, bus)
+        self.driver = driver
+        self._identity = driver.identify()
+        self._limits_mm = driver.limits_mm()
+
+    def _acquire(self) -> DistanceReading:
+        return self.driver.read()
+
+    def _value(self, reading: DistanceReading) -> float:
+        return reading.distance_mm
+
+    def _configuration(self) -> dict[str, Any]:
+        near_mm, far_mm = self._limits_mm
+        return {**vars(self._identity), "near_mm": near_mm, "far_mm": far_mm}

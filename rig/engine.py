@@ -1,108 +1,16 @@
-"""bluesky's RunEngine, made quiet, and made to obey Ctrl-C and SIGTERM as a bench must."""
+"""bluesky's RunEngine, made quiet, and made to obey `rig.interrupts`."""
 
 import contextlib
 import io
 import logging
-import os
-import select
-import signal
-import sys
-import threading
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from bluesky.run_engine import RunEngine
 from bluesky.utils import FailedStatus, Msg, RunEngineInterrupted
 
 from rig.errors import Interrupted
-
-RETRY_S = 0.02
-
-
-class Interrupts:
-    """Turns signals into: stop all axes at once, then pause the engine, then either ask or abort.
-
-    The work is done on a thread of its own, woken by the C-level handler, so that neither a busy main thread nor the engine's
-    loop can delay the stop.
-
-    Parameters
-    ----------
-    stop_axes : callable
-        Puts the stop on every axis's wire; safe from any thread.
-    ask : bool
-        True at a terminal: the first Ctrl-C pauses and asks. A second one, or SIGTERM, aborts.
-    """
-
-    def __init__(self, stop_axes: Callable[[], Any], *, ask: bool) -> None:
-        self.ask = ask
-        self.reason = ""
-        self.pausing = threading.Event()
-        self.aborting = threading.Event()
-        self._stop_axes = stop_axes
-        self._engine: RunEngine | None = None
-        self._engine_lock = threading.Lock()
-
-    def __enter__(self) -> "Interrupts":
-        self._reader, self._writer = os.pipe()
-        os.set_blocking(self._writer, False)
-        self._old_wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
-        self._old_handlers = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGINT, signal.SIGTERM)}
-        self._thread = threading.Thread(target=self._watch, name="interrupts", daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        for number, handler in self._old_handlers.items():
-            signal.signal(number, handler)
-        signal.set_wakeup_fd(self._old_wakeup)
-        os.write(self._writer, b"\0")
-        self._thread.join()
-        os.close(self._reader)
-        os.close(self._writer)
-
-    @contextlib.contextmanager
-    def watching(self, engine: RunEngine) -> Iterator[None]:
-        """Pause `engine` when a signal comes, as long as this context lasts."""
-        self._engine = engine
-        try:
-            yield
-        finally:
-            with self._engine_lock:  # a request that is on its way needs the engine's loop to be alive
-                self._engine = None
-
-    def go_on(self) -> None:
-        """Forget the pause that was asked for."""
-        self.pausing.clear()
-
-    def check(self) -> None:
-        """Raise Interrupted where a signal has come."""
-        if self.pausing.is_set():
-            raise Interrupted(self.reason)
-
-    def _watch(self) -> None:
-        while (number := os.read(self._reader, 1)[0]) != 0:
-            if number not in (signal.SIGINT, signal.SIGTERM):
-                continue
-            again = self.pausing.is_set()
-            self.reason = f"interrupted by {signal.Signals(number).name}"
-            self.pausing.set()
-            self._stop_axes()
-            if number == signal.SIGTERM or again or not self.ask:
-                self.aborting.set()
-            self._pause_engine()
-
-    def _pause_engine(self) -> None:
-        """Ask until the engine has taken it: a request that comes between two states would be lost."""
-        while self.pausing.is_set():
-            with self._engine_lock:
-                engine = self._engine
-                if engine is None or engine.state.is_paused:
-                    return
-                if engine.state.is_running:
-                    with contextlib.suppress(Exception):  # the state may change between the question and the request
-                        engine.request_pause(defer=False)
-            time.sleep(RETRY_S)
+from rig.interrupts import Interrupts
 
 
 def run_plan(
@@ -170,29 +78,6 @@ def _run(engine: RunEngine, plan: Iterable[Msg], interrupts: Interrupts, decide:
             raise Interrupted(interrupts.reason or "aborted")
         interrupts.go_on()
         step = engine.resume
-
-
-def ask_at_terminal(interrupts: Interrupts) -> bool:
-    """Ask the technician at the terminal whether to go on; a further signal means no."""
-    print("\npaused, all axes stopped. Go on (g) or abort (a)? ", end="", file=sys.stderr, flush=True)
-    while not interrupts.aborting.is_set():
-        ready, _, _ = select.select([sys.stdin], [], [], 0.1)
-        if not ready:
-            continue
-        answer = sys.stdin.readline()
-        word = answer.strip().lower()
-        if not answer or word in ("a", "abort"):
-            return False
-        if word in ("g", "go", "go on"):
-            return True
-        print("g to go on, a to abort: ", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
-    return False
-
-
-def at_terminal() -> bool:
-    """Tell whether somebody is there to be asked."""
-    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def _by_text(callback: Callable[[str, dict[str, Any]], Any]) -> Callable[[Any, dict[str, Any]], None]:

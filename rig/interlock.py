@@ -1,30 +1,33 @@
 """Where the arms may stand, and in which order they may get there. Pure checks; nothing here moves."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rig.errors import InterlockError
 
 
 @dataclass(frozen=True)
 class KeepOut:
-    """The zone in which the detector's arm meets, or stands in the light of, the source's arm.
+    """The zone in which the detector's arm meets the source's arm, and the one in which it stands in the light.
 
     Parameters
     ----------
     within_deg : float
-        No reading and no stop with `|theta_r - theta_i|` below this.
+        No stop with `|theta_r - theta_i|` below this.
     crossing : bool
         True where the arms run at different radii, so that one may pass through the zone without stopping in it.
+    shadow_deg : float
+        No reading with `|theta_r - theta_i|` below this: the detector would block the lamp.
     """
 
     within_deg: float
     crossing: bool
+    shadow_deg: float = 0.0
 
 
 @dataclass(frozen=True)
 class Interlock:
-    """Limits of each axis and the keep-out between the arms, in degrees of theta.
+    """Limits of each axis and the keep-out between the arms, in degrees of theta (mm for a linear axis).
 
     Parameters
     ----------
@@ -32,19 +35,23 @@ class Interlock:
     keep_out : KeepOut
     arms : pair of axis names
         The two arms the keep-out speaks of: the source's and the detector's.
+    units : mapping of axis name to unit
+        Of the axes that are not in degrees.
     """
 
     limits: Mapping[str, tuple[float, float]]
     keep_out: KeepOut
     arms: tuple[str, str] = ("source", "detector")
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def check_limits(self, axis: str, theta_deg: float) -> None:
         """Raise InterlockError where `theta_deg` lies outside the limits of `axis`."""
         low, high = self.limits[axis]
         if not low <= theta_deg <= high:
+            unit = self.units.get(axis, "deg")
             raise InterlockError(
-                f"axis {axis}: {theta_deg:g} deg is outside its limits {low:g} to {high:g} deg; "
-                f"nothing was moved. Choose other angles, or widen axes.{axis}.limits in rig.toml if the bench allows it"
+                f"axis {axis}: {theta_deg:g} {unit} is outside its limits {low:g} to {high:g} {unit}; "
+                f"nothing was moved. Choose another, or widen axes.{axis}.limits in rig.toml if the bench allows it"
             )
 
     def blocked(self, position: Mapping[str, float]) -> bool:
@@ -60,8 +67,20 @@ class Interlock:
             source, detector = self.arms
             raise InterlockError(
                 f"{detector} at {position[detector]:g} deg is within {self.keep_out.within_deg:g} deg of the {source} arm at "
+                f"{position[source]:g} deg, too close; nothing was moved. Leave this angle out"
+            )
+
+    def check_reading(self, position: Mapping[str, float]) -> None:
+        """Raise InterlockError where nothing can be read at `position`: it is not allowed, or the detector would block the lamp."""
+        for axis, theta_deg in position.items():
+            self.check_limits(axis, theta_deg)
+        source, detector = self.arms
+        if abs(position[detector] - position[source]) < self.keep_out.shadow_deg:
+            raise InterlockError(
+                f"{detector} at {position[detector]:g} deg is within {self.keep_out.shadow_deg:g} deg of the {source} arm at "
                 f"{position[source]:g} deg, where it blocks the light; nothing was moved. Leave this angle out"
             )
+        self.check_position(position)
 
     def check_move(self, position: Mapping[str, float], axis: str, target_deg: float) -> None:
         """Raise InterlockError where `axis` may not go from `position` to `target_deg` while the other arm stands still."""
@@ -74,7 +93,7 @@ class Interlock:
         if self.blocked(after):
             raise InterlockError(
                 f"{detector} at {after[detector]:g} deg would stand within {self.keep_out.within_deg:g} deg of the {source} arm at "
-                f"{after[source]:g} deg, where it blocks the light"
+                f"{after[source]:g} deg, too close"
             )
         gap_before, gap_after = (p[detector] - p[source] for p in (before, after))
         if not self.keep_out.crossing and gap_before * gap_after < 0:

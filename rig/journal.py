@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rig.errors import RunError
+from rig.files import fsync_folder
 
 SCHEMA_VERSION = 1
 
@@ -56,7 +57,7 @@ class JournalWriter:
             if not new and path.stat().st_size and not _ends_with_newline(path):
                 self._file.write(b"\n")
             if new:
-                _fsync_folder(path.parent)
+                fsync_folder(path.parent)
         except OSError as exc:
             raise RunError(f"{path}: cannot be written: {exc.strerror}") from exc
 
@@ -114,11 +115,3 @@ def _ends_with_newline(path: Path) -> bool:
     with path.open("rb") as file:
         file.seek(-1, os.SEEK_END)
         return file.read(1) == b"\n"
-
-
-def _fsync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

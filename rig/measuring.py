@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rig.config import BenchConfig
 from rig.errors import RunError
 from rig.interlock import Interlock
-from rig.runs import Run, start_metadata
+from rig.interrupts import Interrupts
+from rig.runs import INCIDENTS, Run, start_metadata
 from rig.trajectory import Trajectory
+from rig.workspace import Workspace
 
 if TYPE_CHECKING:
     from rig.bench import Bench
-    from rig.engine import Interrupts
 
 OVERHEAD_S = 0.02
 """What engine, journal and wire add to a reading; only for the estimate of time."""
@@ -35,9 +36,8 @@ def check_trajectory(trajectory: Trajectory, interlock: Interlock) -> None:
     before: dict[str, float] | None = None
     for point in trajectory.points():
         target = {"source": point.theta_i, "detector": point.theta_r}
-        if before is None:
-            interlock.check_position(target)
-        else:
+        interlock.check_reading(target)
+        if before is not None:
             interlock.order(before, target)
         before = target
 
@@ -84,7 +84,7 @@ def travel_estimate_s(order: Order) -> float:
                     profile = MotionProfile(axis.speed or 10.0, axis.acceleration or 100.0)
                     moves.append(profile.duration_s(distance) + axis.settle_s)
             total += max(moves)
-        total += order.trajectory.repeat * (order.config.sensor.integration_s + OVERHEAD_S)
+        total += order.trajectory.repeat * ((order.config.sensor.integration_s or 0.0) + OVERHEAD_S)
         before = target
     return total
 
@@ -101,12 +101,14 @@ class Watcher(Protocol):
     def document(self, name: str, doc: Mapping[str, Any]) -> None:
         """Learn of a document; it is on the disk already."""
 
-    def decide(self, interrupts: "Interrupts") -> bool:
+    def decide(self, interrupts: Interrupts) -> bool:
         """Answer, while the run is paused, whether to go on."""
 
 
-def measure(order: Order, folder: Path, watcher: Watcher) -> None:
+def measure(order: Order, folder: Path, watcher: Watcher, workspace: Workspace, *, trace: str | None = None) -> None:
     """Measure `order` into the run folder `folder`, and leave the bench stopped.
+
+    What the links did about trouble is written into the folder too; `trace` names a file for every byte.
 
     Raises
     ------
@@ -116,11 +118,16 @@ def measure(order: Order, folder: Path, watcher: Watcher) -> None:
         The run is closed as failed; what was measured is in it.
     """
     from rig.bench import open_bench
-    from rig.engine import Interrupts, run_plan
+    from rig.engine import run_plan
+    from rig.incidents import IncidentLog
     from rig.journal import JournalWriter
     from rig.plans import sweep
+    from rig.session import paperwork
 
-    with open_bench(order.config, order.cultivar) as bench:
+    with (
+        paperwork(order.config, workspace, trace=trace, report=IncidentLog(folder / INCIDENTS)) as papers,
+        open_bench(order.config, order.cultivar, paperwork=papers) as bench,
+    ):
         watcher.opened(bench)
         metadata = {
             **start_metadata(),
@@ -132,7 +139,7 @@ def measure(order: Order, folder: Path, watcher: Watcher) -> None:
             "bench": order.config.name,
             "config_sha256": order.config.sha256,
             "num_points": len(order.trajectory),
-            "detectors": [bench.meter.name],
+            "detectors": [sensor.name for sensor in (bench.meter, *bench.monitors)],
             "motors": list(bench.axes),
             **order.metadata,
         }

@@ -46,9 +46,11 @@ def move(bench: Bench, target: Mapping[str, float]) -> Plan:
 
 
 def _read(bench: Bench) -> Plan:
-    yield Msg("trigger", bench.meter, group="reading")
+    sensors = (bench.meter, *bench.monitors)
+    for sensor in sensors:
+        yield Msg("trigger", sensor, group="reading")
     yield Msg("wait", None, group="reading")
     yield Msg("create", None, name="primary")
-    for device in (*bench.axes.values(), bench.meter):
+    for device in (*bench.axes.values(), *sensors):
         yield Msg("read", device)
     yield Msg("save")

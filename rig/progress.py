@@ -12,7 +12,7 @@ from rig.units import engineering
 
 if TYPE_CHECKING:
     from rig.bench import Bench
-    from rig.engine import Interrupts
+    from rig.interrupts import Interrupts
 
 HEADER = f"{'reading':>8} {'theta_i':>9} {'theta_r':>9} {'reading':>12}"
 
@@ -59,6 +59,8 @@ class SweepScreen:
 
     def opened(self, bench: "Bench") -> None:
         """Say what will happen before the first reading."""
+        for notice in bench.notices:
+            self.console.print(f"note: {notice}", soft_wrap=True)
         lost = [name for name, axis in bench.axes.items() if not axis.homed]
         if lost:
             self.console.print(f"homing {', '.join(lost)}")
@@ -78,7 +80,7 @@ class SweepScreen:
 
     def decide(self, interrupts: "Interrupts") -> bool:
         """Ask whether to go on."""
-        from rig.engine import ask_at_terminal
+        from rig.interrupts import ask_at_terminal
 
         self._progress.stop()
         goes_on = ask_at_terminal(interrupts)

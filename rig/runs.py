@@ -20,6 +20,9 @@ from rig.files import write_atomically
 from rig.journal import SCHEMA_VERSION, read_documents
 from rig.workspace import pick
 
+INCIDENTS = "incidents.jsonl"
+"""In a run's folder: what was done about trouble on the wires while it was measured."""
+
 GEOMETRY = "theta_r positive on the light's side; z = specimen normal, x in the plane of incidence on the light's side"
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from rig.config import SIMULATED_PORT, BenchConfig
+from rig.config import ANGLES, SIMULATED_PORT, AxisConfig, BenchConfig
 from rig.errors import ConfigError, RigError
 
 
@@ -23,7 +23,7 @@ class SimulatedBench:
 
     def url(self, port: str) -> str:
         """Return the address behind a port such as `sim:stages`; raise ConfigError where there is none."""
-        name = port.removeprefix(SIMULATED_PORT)
+        name = _instrument(port)
         if name not in self.urls:
             raise ConfigError(f"port {port!r}: the simulated bench has {', '.join(SIMULATED_PORT + known for known in self.urls)}")
         return self.urls[name]
@@ -48,6 +48,9 @@ def simulated_bench(config: BenchConfig, specimen: str) -> Iterator[SimulatedBen
     command = [sys.executable, "-m", "sim", "--specimen", specimen, "--speed", repr(config.simulation.speed), "--until-eof", "--no-pty"]
     seed = config.simulation.seed if config.simulation.seed is not None else int.from_bytes(os.urandom(4), "little")
     command += ["--seed", str(seed)]
+    command += ["--instruments", ",".join(sorted({_instrument(device.port) for device in config.devices.values()}))]
+    for arm in ANGLES:
+        command += [f"--{arm}", _carrier(config.axes[arm])]
     # A new session: a Ctrl-C at the terminal is for us, and the instruments must live to be stopped.
     with (
         tempfile.TemporaryFile() as complaints,
@@ -61,7 +64,7 @@ def simulated_bench(config: BenchConfig, specimen: str) -> Iterator[SimulatedBen
             line = process.stdout.readline()
             try:
                 parameters = json.loads(line)
-                urls = {device["name"]: device["tcp"] for device in parameters["devices"]}
+                urls = {device["name"]: device.get("tcp") or f"folder:{device['folder']}" for device in parameters["devices"]}
             except (ValueError, KeyError, TypeError):
                 complaints.seek(0)
                 last = complaints.read().decode(errors="replace").strip().splitlines()[-1:]
@@ -73,6 +76,16 @@ def simulated_bench(config: BenchConfig, specimen: str) -> Iterator[SimulatedBen
                 process.wait(5)
             except subprocess.TimeoutExpired:
                 process.kill()
+
+
+def _instrument(port: str) -> str:
+    return port.removeprefix(SIMULATED_PORT)
+
+
+def _carrier(axis: AxisConfig) -> str:
+    """Say which axis of which simulated instrument carries an arm."""
+    number = axis.options.get("address", axis.options.get("axis", 1))
+    return f"{_instrument(axis.port)}:{number}"
 
 
 def _environment() -> dict[str, str]:

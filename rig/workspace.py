@@ -44,6 +44,16 @@ class Workspace:
         return self.root / "models"
 
     @property
+    def axes(self) -> Path:
+        """What each axis was last told."""
+        return self.root / "axes.json"
+
+    @property
+    def lock(self) -> Path:
+        """Held by the program that has the bench."""
+        return self.root / "bench.lock"
+
+    @property
     def cultivars(self) -> Path:
         """The lab's own cultivars."""
         return self.root / "cultivars.toml"

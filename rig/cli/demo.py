@@ -41,7 +41,7 @@ def command(settings: Settings, petals: int) -> int:
     for cultivar in TABLE_1:
         label = cultivar.abbreviation
         folder = new_run_path(settings.workspace.runs, label)
-        run_sweep(new_order(config, label, trajectory), folder)
+        run_sweep(new_order(config, label, trajectory), folder, settings.workspace)
         runs[label] = Run(folder)
         fits[label] = fit_run(runs[label])
         store_fit(settings.workspace.fits, fits[label])

@@ -13,6 +13,12 @@ from rig.workspace import Workspace
 COMMANDS = {
     "init": ("rig.cli.init", "Write a commented rig.toml to start from."),
     "sweep": ("rig.cli.sweep", "Measure how a petal reflects light by angle."),
+    "devices": ("rig.cli.devices", "List the supported instruments; ask the bench's who they are."),
+    "status": ("rig.cli.status", "Say where every axis stands and what it was last told."),
+    "home": ("rig.cli.home", "Find the reference of axes."),
+    "move": ("rig.cli.move", "Send an axis to a position."),
+    "stop": ("rig.cli.stop", "Stop every axis, also those another rig command moves."),
+    "read": ("rig.cli.read", "Take readings from sensors."),
     "runs": ("rig.cli.runs", "List, show and annotate stored runs."),
     "cultivars": ("rig.cli.cultivars", "List the known cultivars, or add one."),
     "fit": ("rig.cli.fit", "Fit the paper's reflection model to a run or a table."),
@@ -23,6 +29,7 @@ COMMANDS = {
     "view": ("rig.cli.view", "Show a flower in the browser."),
     "render": ("rig.cli.render", "Ray-cast a flower with a fitted reflectance."),
     "figures": ("rig.cli.figures", "Draw the paper's figures from the newest fits."),
+    "sim": ("rig.cli.sim", "Serve simulated instruments to any software."),
     "demo": ("rig.cli.demo", "The whole chain on the simulated bench."),
 }
 

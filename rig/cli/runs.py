@@ -2,6 +2,7 @@
 
 import json
 import time
+from dataclasses import asdict
 from typing import Any
 
 import click
@@ -9,7 +10,8 @@ import click
 from rig.cli.settings import Settings
 from rig.errors import RunError
 from rig.fits import fit_of_run
-from rig.runs import Run, add_note, find_run, list_runs
+from rig.incidents import describe, read_incidents
+from rig.runs import INCIDENTS, Run, add_note, find_run, list_runs
 from rig.tables import fit_table, run_table
 
 
@@ -64,6 +66,10 @@ def show(settings: Settings, run: str, as_json: bool) -> None:
         click.echo(json.dumps(_show_json(found) | ({"fit": fit.id, **fit.fit.to_dict()} if fit else {})))
         return
     click.echo(run_table(found))
+    if incidents := read_incidents(found.folder / INCIDENTS):
+        click.echo(f"\n{len(incidents)} troubles on the wires, dealt with:")
+        for incident in incidents:
+            click.echo(f"  {describe(incident)}")
     if fit:
         click.echo("\n" + fit_table(fit))
 
@@ -75,6 +81,7 @@ def _show_json(run: Run) -> dict[str, Any]:
         "trajectory": run.start["trajectory"],
         "readings": [vars(reading) for reading in run.readings],
         "notes": run.notes,
+        "incidents": [asdict(incident) for incident in read_incidents(run.folder / INCIDENTS)],
         "folder": str(run.folder),
     }
 

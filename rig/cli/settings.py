@@ -2,7 +2,11 @@
 
 from dataclasses import dataclass
 
+import click
+
 from rig.workspace import Workspace
+
+trace_option = click.option("--trace", metavar="FILE", help="Write every byte, both ways, with times; `rig sim replay FILE` plays it back.")
 
 
 @dataclass(frozen=True)

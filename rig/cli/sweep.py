@@ -4,14 +4,15 @@ from pathlib import Path
 
 import click
 
-from rig.cli.settings import Settings
+from rig.cli.settings import Settings, trace_option
 from rig.config import BenchConfig, load_config
 from rig.cultivars import find_cultivar, load_cultivars
 from rig.errors import ConfigError
 from rig.measuring import Order, measure, new_order, redo_order, travel_estimate_s
-from rig.runs import begin_run, find_run, new_run_path
+from rig.runs import INCIDENTS, begin_run, find_run, new_run_path
 from rig.trajectory import Trajectory, parse_angles
 from rig.units import duration
+from rig.workspace import Workspace
 
 SIMULATED = "SIMULATED"
 
@@ -34,6 +35,7 @@ theta_r is positive on the light's side: +45 is back to the light, -45 the mirro
 @click.option("--out", metavar="DIR", help="The run's own folder [default: a new one in the workspace].")
 @click.option("--redo", metavar="RUN", help="Measure points of this run again, into it; the new readings count.")
 @click.option("--dry-run", is_flag=True, help="Check and print the points and the time; open and move nothing.")
+@trace_option
 @click.pass_obj
 def command(
     settings: Settings,
@@ -44,6 +46,7 @@ def command(
     out: str | None,
     redo: str | None,
     dry_run: bool,
+    trace: str | None,
 ) -> None:
     """Measure how a petal reflects light by angle, and store the run."""
     config = load_config(settings.config)
@@ -52,13 +55,14 @@ def command(
         _print_points(order)
         return
     folder = folder or new_run_path(settings.workspace.runs, order.cultivar)
-    run_sweep(order, folder)
+    run_sweep(order, folder, settings.workspace, trace=trace)
     click.echo(folder.name if folder.parent == settings.workspace.runs else str(folder))
 
 
-def run_sweep(order: Order, folder: Path, *, ask: bool | None = None) -> None:
+def run_sweep(order: Order, folder: Path, workspace: Workspace, *, ask: bool | None = None, trace: str | None = None) -> None:
     """Measure `order` into `folder` with the screen on; on the way out say where the readings lie."""
-    from rig.engine import at_terminal
+    from rig.incidents import read_incidents
+    from rig.interrupts import at_terminal
     from rig.progress import SweepScreen
 
     mark = f"{SIMULATED}: " if order.config.simulated else ""
@@ -66,12 +70,17 @@ def run_sweep(order: Order, folder: Path, *, ask: bool | None = None) -> None:
     begin_run(folder, order.config.text)
     with SweepScreen(len(order.trajectory), title, ask=at_terminal() if ask is None else ask) as screen:
         try:
-            measure(order, folder, screen)
+            measure(order, folder, screen, workspace, trace=trace)
         finally:
+            if log := read_incidents(folder / INCIDENTS):
+                screen.console.print(
+                    f"{len(log)} troubles on the wires were dealt with, see `rig runs show`; the last: {log[-1]}", soft_wrap=True
+                )
             if (folder / "journal.jsonl").exists():
                 screen.console.print(f"{mark}stored in {folder}", soft_wrap=True)
             else:  # nothing was begun: no empty run is left behind
-                (folder / "config.toml").unlink(missing_ok=True)
+                for name in ("config.toml", INCIDENTS):
+                    (folder / name).unlink(missing_ok=True)
                 folder.rmdir()
 
 

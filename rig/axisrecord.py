@@ -1,0 +1,111 @@
+"""What each axis was last told, on the disk, so that the next program that opens it knows."""
+
+import json
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rig.errors import RunError
+from rig.files import write_atomically
+
+SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class AxisRecord:
+    """The last command to an axis and what came of it; positions as the stage counts.
+
+    Attributes
+    ----------
+    setpoint : float, optional
+        Where it was sent; None for homing.
+    readback : float
+        Where it stood, when `under_way` just before the command went out.
+    under_way : bool
+        The motion was begun and nobody has seen its end.
+    homed : bool
+        The stage had its reference.
+    time : float, s
+        When this was written (`time.time`).
+    """
+
+    setpoint: float | None
+    readback: float
+    under_way: bool
+    homed: bool
+    time: float
+
+
+class AxisRecords:
+    """The records of all axes of a workspace, by the stage's identity; safe from any thread.
+
+    Parameters
+    ----------
+    path : Path
+        A JSON file, replaced as a whole and brought to the disk at each change.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+
+    def get(self, identity: str) -> AxisRecord | None:
+        """Return what is known of a stage.
+
+        Raises
+        ------
+        RunError
+            The file is there and is not what it should be.
+        """
+        with self._lock:
+            return self._read().get(identity)
+
+    def put(self, identity: str, *, setpoint: float | None, readback: float, under_way: bool, homed: bool) -> None:
+        """Write down what a stage was told, or where it came to rest; on the disk when this returns.
+
+        Raises
+        ------
+        RunError
+            It cannot be written. Nothing should move then.
+        """
+        record = AxisRecord(setpoint, readback, under_way, homed, time.time())
+        with self._lock:
+            records = {**self._read(), identity: record}
+            document = {"schema_version": SCHEMA_VERSION, "axes": {key: asdict(each) for key, each in records.items()}}
+            try:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(self._path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+            except OSError as exc:
+                raise RunError(f"{self._path}: cannot be written: {exc.strerror or exc}; nothing was moved") from exc
+
+    def of(self, identity: str) -> "AxisMemory":
+        """Return the part that is about one stage."""
+        return AxisMemory(self, identity)
+
+    def _read(self) -> Mapping[str, AxisRecord]:
+        try:
+            document = json.loads(self._path.read_text(encoding="utf-8"))
+            return {key: AxisRecord(**fields) for key, fields in document["axes"].items()}
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
+            hint = "look where the arms stand, delete the file, and home the axes"
+            raise RunError(f"{self._path}: not the record of the axes' last commands: {exc}; {hint}") from exc
+
+
+@dataclass(frozen=True)
+class AxisMemory:
+    """The record of one stage."""
+
+    records: AxisRecords
+    identity: str
+
+    def get(self) -> AxisRecord | None:
+        """Return what is known; see `AxisRecords.get`."""
+        return self.records.get(self.identity)
+
+    def put(self, *, setpoint: float | None, readback: float, under_way: bool, homed: bool) -> None:
+        """Write it down; see `AxisRecords.put`."""
+        self.records.put(self.identity, setpoint=setpoint, readback=readback, under_way=under_way, homed=homed)
