@@ -8,9 +8,10 @@ from typing import Literal, get_args
 
 from drivers.errors import DeviceError
 
-What = Literal["repeated", "resynchronised", "stale bytes dropped", "foreign line passed over"]
+What = Literal["repeated", "resynchronised", "stale bytes dropped", "foreign line passed over", "motion followed", "motion sent again"]
 """Named for what was done: a request sent once more; a device asked something unmistakable, or left alone, until nothing was owed any more;
-bytes dropped that came before the question; a line dropped that came while an answer was waited for and that no request claimed."""
+bytes dropped that came before the question; a line dropped that came while an answer was waited for and that no request claimed; a motion
+whose start was in doubt followed to its end, or, the axis resting where it was, sent once more."""
 
 WHATS: tuple[What, ...] = get_args(What)
 

@@ -36,12 +36,15 @@ class AxisState:
         Whether the axis has a reference position.
     warnings : tuple of str
         Warning flags in the device's own spelling, all that are set.
+    waiting : bool
+        The axis has been told to move and its controller is busy with another axis; it counts as moving.
     """
 
     position: float
     moving: bool
     homed: bool
     warnings: tuple[str, ...] = ()
+    waiting: bool = False
 
 
 @dataclass(frozen=True)

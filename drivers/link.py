@@ -8,16 +8,19 @@ that claims it.
 from __future__ import annotations
 
 import io
+import logging
 import os
 import select
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from drivers.errors import BadChecksum, DeviceError, InvalidSetting, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.incidents import Incident, Report, What, in_hex, story
 
 if TYPE_CHECKING:
     import serial
@@ -26,13 +29,15 @@ T = TypeVar("T")
 S = TypeVar("S")
 Traffic = Callable[[float, Literal["tx", "rx"], bytes], None]
 
+log = logging.getLogger(__name__)
+
 TERMINATORS = {"CR": b"\r", "LF": b"\n", "CRLF": b"\r\n", "LFCR": b"\n\r"}
 
 _REOPEN = "check the cable and the device's power, then open the port again"
 _CHUNK = 4096
 _SLICE_S = 0.05  # how soon a waiting thread notices that the link was closed under it
 _STALE_CHUNKS = 64  # a device that babbles for ever must not hold up the request
-_SKIPPED_LINES = 8  # lines nobody claimed, kept for the error message
+_SKIPPED_LINES = 8  # lines nobody claimed, kept for error messages and reports
 
 
 class _Waiting(Generic[T]):
@@ -78,6 +83,14 @@ class Link:
     traffic : callable, optional
         Called with (monotonic time in s, ``"tx"`` or ``"rx"``, bytes) for all that passes, as it passes, from whichever
         thread handles it; it must be quick.
+    report : callable, optional
+        Called with an `Incident` whenever the link did something about trouble: sent a request again, resynchronised, dropped input.
+        It is called between exchanges, never with a request on the wire of the same thread. What it raises is logged and goes no further.
+
+    Attributes
+    ----------
+    unasked : tuple of bytes
+        Beginnings of lines that the device sends on its own: to drop such lines is no incident.
     """
 
     def __init__(
@@ -89,22 +102,26 @@ class Link:
         timeout_s: float = 1.0,
         terminator: bytes = b"\r\n",
         traffic: Traffic | None = None,
+        report: Report | None = None,
     ) -> None:
         self.url = url
         self.device = device
         self.timeout_s = timeout_s
         self.terminator = terminator
+        self.unasked: tuple[bytes, ...] = ()
         self._port = port
         self._traffic = traffic
+        self._report = report
         self._turn = threading.Lock()  # held for a whole ordinary exchange
         self._write_lock = threading.Lock()  # held only while bytes go out
-        self._state = threading.Lock()  # guards the next three
+        self._state = threading.Lock()  # guards the next four
         self._waiting: list[_Waiting[Any]] = []  # in the order sent
+        self._strays: deque[tuple[What, bytes]] = deque(maxlen=_SKIPPED_LINES)  # input nobody claimed, not yet reported
         self._reading = False  # one thread at a time reads the port, and owns the buffer, for all that wait
         self._closed = False
         self._changed = threading.Condition(self._state)
         self._buffer = b""
-        self._shared: dict[Callable[[], Any], Any] = {}
+        self._shared: dict[Callable[[Link], Any], Any] = {}
         self._fd = _file_descriptor(port)
         if self._fd is None:
             port.timeout = _SLICE_S
@@ -120,6 +137,7 @@ class Link:
         timeout_s: float = 1.0,
         terminator: bytes = b"\r\n",
         traffic: Traffic | None = None,
+        report: Report | None = None,
         **settings: Any,
     ) -> Link:
         """Open a port by name (``/dev/ttyUSB0``, ``COM3``) or URL (``socket://host:port``, ``rfc2217://...``).
@@ -152,7 +170,7 @@ class Link:
             raise InvalidSetting(f"{type(error).__name__}: {error}", device=device, port=url, attempt=attempt) from error
         if url.startswith("socket://"):
             _send_small_packets_at_once(port.fileno())
-        return cls(port, url=url, device=device, timeout_s=timeout_s, terminator=terminator, traffic=traffic)
+        return cls(port, url=url, device=device, timeout_s=timeout_s, terminator=terminator, traffic=traffic, report=report)
 
     def __enter__(self) -> Link:
         return self
@@ -172,14 +190,14 @@ class Link:
         with self._write_lock:
             self._port.close()
 
-    def shared(self, kind: Callable[[], S]) -> S:
-        """Return what all devices of a kind on this link have in common: made by `kind` for the first, the same for the others.
+    def shared(self, kind: Callable[[Link], S]) -> S:
+        """Return what all devices of a kind on this link have in common: made by `kind` of the link for the first, the same for the others.
 
         Axes are opened one by one, yet their controller may have one line of answers, one error queue, one busy flag.
         """
         with self._state:
             if kind not in self._shared:
-                self._shared[kind] = kind()
+                self._shared[kind] = kind(self)
             found: S = self._shared[kind]
         return found
 
@@ -247,15 +265,40 @@ class Link:
         try:
             try:
                 return once()
-            except (TransportTimeout, BadChecksum, UnexpectedReply):
+            except (TransportTimeout, BadChecksum, UnexpectedReply) as error:
                 if not repeatable:
                     raise
+                self._tell_of_strays(device, attempt)
+                self.tell("repeated", story(error), device=device, attempt=attempt)
             return once()
         except DeviceError as error:
             elapsed_s = time.monotonic() - started
             device = device or self.device
             error.complete(device=device, port=self.url, attempt=attempt, expected=expected, elapsed_s=elapsed_s)
             raise
+        finally:
+            if self._strays:
+                self._tell_of_strays(device, attempt)
+
+    def tell(self, what: What, detail: str, *, device: str = "", attempt: str = "") -> None:
+        """Report an incident; that must never spoil an exchange."""
+        if self._report is None:
+            return
+        incident = Incident(time.time(), self.url, device or self.device, attempt, what, detail)
+        try:
+            self._report(incident)
+        except Exception:
+            log.exception("not reported: %s", incident)
+
+    def _tell_of_strays(self, device: str, attempt: str) -> None:
+        with self._state:
+            strays = tuple(self._strays)
+            self._strays.clear()
+        kinds: tuple[What, ...] = ("stale bytes dropped", "foreign line passed over")
+        for kind in kinds:
+            data = b"".join(line for what, line in strays if what == kind)
+            if data:
+                self.tell(kind, in_hex(data), device=device, attempt=attempt)
 
     def _send_and_wait(
         self,
@@ -353,8 +396,14 @@ class Link:
         with self._state:
             for frame in frames:
                 claimed = any(waiting.offer(frame) for waiting in self._waiting if not waiting.done)
-                if claimed and len(self._waiting) > 1:
+                if not claimed:
+                    self._note_stray(frame + self.terminator)
+                elif len(self._waiting) > 1:
                     self._changed.notify_all()
+
+    def _note_stray(self, data: bytes) -> None:
+        if not data.startswith(self.unasked):
+            self._strays.append(("foreign line passed over" if self._waiting else "stale bytes dropped", data))
 
     def _drop_stale_input(self) -> None:
         """Drop what came before the question, for it cannot be the answer; except what an urgent request is waiting for."""
@@ -363,7 +412,9 @@ class Link:
             if not chunk:
                 break
             self._distribute(chunk)
-        if not self._waiting:
+        if not self._waiting and self._buffer:
+            with self._state:
+                self._note_stray(self._buffer)
             self._buffer = b""
 
     def _receive(self, wait_s: float) -> bytes:

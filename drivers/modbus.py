@@ -31,6 +31,7 @@ from pymodbus.pdu.register_message import (
 
 from drivers.endpoint import Endpoint, Veto
 from drivers.errors import BadChecksum, DeviceError, DeviceFault, InvalidSetting, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.incidents import in_hex, story
 from drivers.link import Link
 
 MOST_READ = 125
@@ -74,6 +75,7 @@ class _ReplyFramer(FramerRTU):
 
     head = b""  # what the reply's function code and data begin with
     length = 0  # of function code and data
+    passed_over = b""  # what came before and after the reply
 
     def await_reply_to(self, request: ModbusPDU) -> None:
         """Know the reply by its request. Source: Application Protocol V1.1b3, 6."""
@@ -90,17 +92,18 @@ class _ReplyFramer(FramerRTU):
 
     def handleFrame(self, data: bytes, exp_devid: int, exp_tid: int) -> tuple[int, ModbusPDU | None]:
         """Return the bytes used up, none, and the reply if it is there."""
-        refusal = bytes([self.head[0] | 0x80])
-        for start in range(len(data)):
-            for head, length in ((self.head, self.length), (refusal, 2)):
+        address, refusal = bytes([exp_devid]), bytes([self.head[0] | 0x80])
+        for head, length in ((address + self.head, self.length), (address + refusal, 2)):
+            start = data.find(head)
+            while 0 <= start <= len(data) - length - 3:
                 frame = data[start : start + length + 3]
-                if len(frame) < length + 3 or frame[0] != exp_devid or not frame.startswith(head, 1):
-                    continue
                 pdu = self.decode(frame)[3]  # empty when the checksum is wrong
                 reply = self.decoder.decode(pdu) if len(pdu) == length else None
                 if reply is not None:
                     reply.dev_id, reply.transaction_id = exp_devid, exp_tid
+                    self.passed_over = data[:start] + data[start + len(frame) :]
                     return len(data), reply
+                start = data.find(head, start + 1)
         return 0, None
 
 
@@ -119,7 +122,7 @@ class _Client(ModbusSerialClient):
         """Send a request and wait for its reply."""
         assert isinstance(self.framer, _ReplyFramer)
         self.framer.await_reply_to(request)
-        self.sent = self.heard = b""
+        self.sent = self.heard = self.framer.passed_over = b""
         self.deadline = time.monotonic() + allowed_s
         return self.execute(False, request)
 
@@ -188,7 +191,7 @@ class ModbusLink(Link):
         # Source: Serial Line V1.02, 2.5.1.1: three and a half characters, and never less than 1.75 ms.
         self._gap_s = max(3.5 * self._character_s, 1.75e-3)
         self._silent_since = 0.0  # when the last byte had passed, as far as is known
-        self._unsettled = False
+        self._unsettled = ""  # what went wrong, until the line has been silent
         self._urgent = 0  # how many urgent requests queue
         self._give_way_at = 0.0
         self._client = _Client(self)
@@ -223,11 +226,12 @@ class ModbusLink(Link):
         allowed_s = self.timeout_s if timeout_s is None else timeout_s
         try:
             try:
-                reply = self._ask_once(request, allowed_s, urgent, veto)
-            except (TransportTimeout, BadChecksum, UnexpectedReply):
+                reply = self._ask_once(request, allowed_s, urgent, veto, device, attempt)
+            except (TransportTimeout, BadChecksum, UnexpectedReply) as error:
                 if not repeatable:
                     raise
-                reply = self._ask_once(request, allowed_s, urgent, veto)
+                self.tell("repeated", story(error), device=device, attempt=attempt)
+                reply = self._ask_once(request, allowed_s, urgent, veto, device, attempt)
             if reply.isError():
                 code = reply.exception_code
                 raise ModbusRefusal(f"refused with exception {code:02X}h ({_MEANINGS.get(code, 'unknown')})", code=code)
@@ -238,20 +242,37 @@ class ModbusLink(Link):
             raise
         return reply
 
-    def _ask_once(self, request: ModbusPDU, allowed_s: float, urgent: bool, veto: Veto | None) -> ModbusPDU:
-        with self._my_turn(urgent):
-            objection = veto() if veto is not None else None
-            if objection is not None:
-                raise objection
-            self._drop_what_is_late(urgent)
-            try:
-                reply = self._client.ask(request, allowed_s)
-            except DeviceError as error:
-                self._unsettled = True
-                error.complete(sent=self._client.sent)
-                raise
-            self._unsettled = False
-            return reply
+    def _ask_once(self, request: ModbusPDU, allowed_s: float, urgent: bool, veto: Veto | None, device: str, attempt: str) -> ModbusPDU:
+        cause = stale = passed_over = ""
+        try:
+            with self._my_turn(urgent):
+                objection = veto() if veto is not None else None
+                if objection is not None:
+                    raise objection
+                silent, stale = self._drop_what_is_late(urgent)
+                if silent:
+                    cause, self._unsettled = self._unsettled, ""
+                try:
+                    reply = self._client.ask(request, allowed_s)
+                except DeviceError as error:
+                    self._unsettled = story(error)
+                    error.complete(sent=self._client.sent)
+                    raise
+                passed_over = self._passed_over()
+                return reply
+        finally:  # when others can have their turn
+            if stale:
+                self.tell("stale bytes dropped", stale, device=device, attempt=attempt)
+            if cause:
+                self.tell("resynchronised", f"by silence on the line after {cause}", device=device, attempt=attempt)
+            if passed_over:
+                self.tell("foreign line passed over", passed_over, device=device, attempt=attempt)
+
+    def _passed_over(self) -> str:
+        """What came with the reply and is not it, in hex; an adapter's echo of the request is no incident."""
+        assert isinstance(self._client.framer, _ReplyFramer)
+        others = self._client.framer.passed_over
+        return in_hex(others) if others != self._client.sent else ""
 
     @contextmanager
     def _my_turn(self, urgent: bool) -> Iterator[None]:
@@ -273,15 +294,23 @@ class ModbusLink(Link):
                 self._reading = False
                 self._changed.notify_all()
 
-    def _drop_what_is_late(self, urgent: bool) -> None:
-        """Let the line fall silent as the protocol asks, and drop what comes meanwhile: it cannot be the answer."""
-        silence_s = _SETTLE_S if self._unsettled and not urgent else self._gap_s
+    def _drop_what_is_late(self, urgent: bool) -> tuple[bool, str]:
+        """Let the line fall silent as the protocol asks, and drop what comes meanwhile: it cannot be the answer.
+
+        Returns whether that was long enough for all that was late, and what was dropped, in hex.
+        """
+        settling = bool(self._unsettled) and not urgent
+        silence_s = _SETTLE_S if settling else self._gap_s
+        dropped = b""
         for _ in range(_STALE_CHUNKS):  # a device that babbles for ever must not hold up the request
             wait_s = self._silent_since + silence_s - time.monotonic()
             if wait_s > 0:
                 time.sleep(wait_s)
-            if not self._receive(0.0):
-                break
+            chunk = self._receive(0.0)
+            if not chunk:
+                return settling, in_hex(dropped)
+            dropped += chunk
+        return False, in_hex(dropped)
 
     def _send_frame(self, frame: bytes) -> None:
         self._send(frame)

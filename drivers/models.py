@@ -110,7 +110,7 @@ class DeviceModel:
             if name not in TERMINATORS:
                 raise InvalidSetting(f"terminator {name!r}", device=self.name, port=url, expected=", ".join(TERMINATORS))
             settings["terminator"] = TERMINATORS[name]
-        return self.open_port(url, device=self.name, timeout_s=timeout_s, traffic=traffic, **settings)
+        return self.open_port(url, device=self.name, timeout_s=timeout_s, traffic=traffic, report=report, **settings)
 
     def open_device(self, link: Link, *, name: str, **options: Any) -> Device:
         """Open a device on a link, which may carry others and stays the caller's to close.

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from drivers.kinds import AxisState
 from rig.errors import RunError
 from rig.files import write_atomically
 
@@ -36,6 +37,14 @@ class AxisRecord:
     under_way: bool
     homed: bool
     time: float
+
+    def vouches(self, state: AxisState, tolerance: float) -> bool:
+        """Tell whether an axis whose controller forgets must still have its reference: it was left homed, and is as it was left.
+
+        A counter that was switched off reads 0, wherever the arm stands: at 0 nothing tells the two apart.
+        """
+        as_left = not self.under_way and not state.moving and abs(state.position - self.readback) <= tolerance
+        return self.homed and as_left and abs(state.position) > tolerance
 
 
 class AxisRecords:

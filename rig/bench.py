@@ -20,6 +20,9 @@ from rig.trace import Trace
 READING = "current"
 """What events call the reading of the main sensor."""
 
+REST_S = 1.0
+"""How long an axis that was told to stop may take to come to rest before the bench is closed, s of real time."""
+
 
 @dataclass(frozen=True)
 class Paperwork:
@@ -134,6 +137,8 @@ def open_bench(
 
 def _leave_stopped(bench: Bench, exc: BaseException | None) -> None:
     failures = bench.stop()
+    for axis in bench.axes.values():
+        axis.await_rest(REST_S)
     if not failures:
         return
     warning = f"AND NOT EVERY AXIS COULD BE STOPPED, it may still be moving: {'; '.join(map(str, failures))}"

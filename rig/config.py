@@ -16,12 +16,16 @@ from rig.kinematics import AxisMap
 
 if TYPE_CHECKING:
     from drivers.kinds import Unit
+    from drivers.models import DeviceModel
 
 SIMULATED_PORT = "sim:"
 """A port that starts so is an instrument of the simulated bench, by name."""
 
 ANGLES = {"source": "theta_i", "detector": "theta_r"}
 """The arms, which every bench has, and the angles they realise. An axis of another name is known by that name."""
+
+INTEGRATION_S = 0.1
+"""Of a light sensor whose model says nothing of it."""
 
 MAIN_SENSOR = "sensor"
 """What a sweep reads; it has a table of its own, the others are under [sensors]."""
@@ -183,8 +187,8 @@ def parse_config(text: str, source: str) -> BenchConfig:
 
 def _axis(name: str, table: "_Table") -> AxisConfig:
     kinds = ("rotary-axis",) if name in ANGLES else ("rotary-axis", "linear-axis")
-    model, kind, options, serial = _device(table, kinds, frozenset({"speed", "acceleration"}))
-    unit: Unit = "mm" if kind == "linear-axis" else "deg"
+    model, options, serial = _device(table, kinds, frozenset({"speed", "acceleration"}))
+    unit: Unit = "mm" if model.kind == "linear-axis" else "deg"
     low, high = table.pair("limits", unit)
     if low >= high:
         raise table.error("limits", f"[{low:g}, {high:g}] are swapped: give [lowest, highest] in {unit}")
@@ -193,7 +197,7 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
         raise table.error("sign", f"{sign:g} may be 1 or -1")
     config = AxisConfig(
         name=name,
-        model=model,
+        model=model.name,
         port=table.text("port"),
         unit=unit,
         map=AxisMap(int(sign), table.number("offset", default=0.0)),
@@ -212,13 +216,14 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
 def _sensor(name: str, table: "_Table") -> SensorConfig:
     main = name == MAIN_SENSOR
     kinds = ("light-sensor",) if main else ("light-sensor", "range-finder")
-    model, kind, options, serial = _device(table, kinds, frozenset({"integration_s", "range"}))
-    light = kind == "light-sensor"
+    model, options, serial = _device(table, kinds, frozenset({"integration_s", "range"}))
+    light = model.kind == "light-sensor"
+    told = model.options.get("integration_s")
     config = SensorConfig(
         name=name,
-        model=model,
+        model=model.name,
         port=table.text("port"),
-        integration_s=table.positive("integration", default=0.1) if light else None,
+        integration_s=table.positive("integration", default=told.default if told else INTEGRATION_S) if light else None,
         range=table.positive("range", default=None) if light else None,
         monitor=light and not main and table.flag("monitor", default=False),
         options=options,
@@ -244,8 +249,8 @@ def _simulation(table: "_Table") -> Simulation:
     return simulation
 
 
-def _device(table: "_Table", kinds: tuple[str, ...], owned: frozenset[str]) -> tuple[str, str, dict[str, Any], dict[str, Any]]:
-    """Return model, its kind, its own options and the line settings that `table` gives; `owned` options have keys of ours."""
+def _device(table: "_Table", kinds: tuple[str, ...], owned: frozenset[str]) -> tuple["DeviceModel", dict[str, Any], dict[str, Any]]:
+    """Return the model, its own options and the line settings that `table` gives; `owned` options have keys of ours."""
     from drivers import catalogue
     from drivers.errors import InvalidSetting
 
@@ -270,7 +275,7 @@ def _device(table: "_Table", kinds: tuple[str, ...], owned: frozenset[str]) -> t
             line[key] = table.value(key)
             if type(line[key]) is not type(default):
                 raise table.error(key, f"{line[key]!r} must be like {default!r}, the setting as delivered")
-    return name, model.kind, options, line
+    return model, options, line
 
 
 def _check_ports(config: BenchConfig) -> None:

@@ -3,6 +3,7 @@
 What each owes the engine: https://blueskyproject.io/bluesky/main/hardware.html
 """
 
+import contextlib
 import math
 import threading
 import time
@@ -18,13 +19,13 @@ from rig.bus import BusWorker, Task
 from rig.clock import Clock
 from rig.errors import InterlockError
 from rig.kinematics import AxisMap
-from rig.status import Status
+from rig.status import Status, StatusTimeout
 
 POLL_S = 0.004
 """How often an axis that should have arrived is asked again, s of real time."""
 
 WATCH_S = 0.05
-"""How often an axis on its way is looked at, s of real time."""
+"""How often an axis on its way is looked at, s of the bench's time."""
 
 ASTRAY = 0.5
 """How far beside its way an axis may be seen, in its unit, before it is stopped."""
@@ -187,8 +188,7 @@ class Axis(Configured):
         left = self._theta_text(record.readback)
         if abs(state.position - record.readback) > self.tolerance:
             return (f"{self.name} was left at {left} {unit} and is at {here} {unit}: switched off, or moved by somebody else; home it",)
-        # A counter that was switched off reads 0, wherever the arm stands: at 0 nothing tells the two apart.
-        if isinstance(self.driver, ForgetfulStage) and not state.homed and record.homed and abs(state.position) > self.tolerance:
+        if isinstance(self.driver, ForgetfulStage) and not state.homed and record.vouches(state, self.tolerance):
             self.driver.trust_reference()
         return ()
 
@@ -237,6 +237,12 @@ class Axis(Configured):
         """
         self._stopped.set()
         self.driver.stop()
+
+    def await_rest(self, timeout_s: float) -> None:
+        """Wait for the end of a motion that was told to stop, so that it is written down; at most so many seconds of real time."""
+        if self._moving is not None:
+            with contextlib.suppress(StatusTimeout):
+                self._moving.exception(timeout_s)
 
     def locate(self) -> dict[str, float]:
         """Return setpoint and readback in degrees."""
@@ -339,7 +345,8 @@ class Axis(Configured):
         speed = self._clock.speed
         started = self._clock.monotonic()
         predicted = duration if way is not None else 0.0
-        yield min(max(predicted, POLL_S * speed), WATCH_S * speed)
+        look = max(WATCH_S, POLL_S * speed)
+        yield min(max(predicted, POLL_S * speed), look)
         while (state := self.refresh()).moving:
             now = self._clock.monotonic()
             if state.waiting:
@@ -353,7 +360,7 @@ class Axis(Configured):
             if way is not None:
                 self._keep_to(way, self._readback, what)
             left = 0.0 if stopped.is_set() else predicted - elapsed
-            yield min(max(left, POLL_S * speed), WATCH_S * speed)
+            yield min(max(left, POLL_S * speed), look)
 
     def _keep_to(self, way: tuple[float, float], theta: float, what: str) -> None:
         """Stop the axis where it has left its way, or its limits: a command may have been damaged on a wire without checksums."""

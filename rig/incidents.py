@@ -1,5 +1,6 @@
 """What was done about trouble on the wires, beside the run it happened in."""
 
+import contextlib
 import json
 import threading
 import time
@@ -29,7 +30,8 @@ class IncidentLog:
         with self._lock:
             self.incidents.append(incident)
             if self._path is not None:
-                with self._path.open("a", encoding="utf-8") as file:
+                # A full disk ends the run where its journal is written, not here in the middle of a motion.
+                with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(asdict(incident)) + "\n")
 
     @property

@@ -78,7 +78,8 @@ def travel_estimate_s(order: Order) -> float:
         target = {"source": point.theta_i, "detector": point.theta_r}
         if before is not None:
             moves = [0.0]
-            for name, axis in order.config.axes.items():
+            for name in target:
+                axis = order.config.axes[name]
                 distance = abs(target[name] - before[name])
                 if distance:
                     profile = MotionProfile(axis.speed or 10.0, axis.acceleration or 100.0)

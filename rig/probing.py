@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from drivers.errors import DeviceError
-from drivers.kinds import LightSensor, RangeFinder, Stage
+from drivers.kinds import ForgetfulStage, LightSensor, RangeFinder, Stage
 from rig.axisrecord import AxisRecord
 from rig.bench import Paperwork
 from rig.config import AxisConfig, BenchConfig, SensorConfig
@@ -61,11 +61,12 @@ def axis_rows(config: BenchConfig, names: Sequence[str], papers: Paperwork) -> l
             state = stage.state()
         finally:
             stage.close()
+        remembered = record is not None and isinstance(stage, ForgetfulStage) and record.vouches(state, axis.tolerance)
         return {
             "position": axis.map.to_theta(state.position),
             "unit": axis.unit,
             "moving": state.moving,
-            "homed": state.homed,
+            "homed": state.homed or remembered,
             "warnings": list(state.warnings),
             "low": axis.limits[0],
             "high": axis.limits[1],

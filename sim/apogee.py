@@ -77,6 +77,7 @@ class QuantumSensor(Unit):
     """
 
     functions = frozenset({3, 16})
+    troubles = ("over-range",)
 
     def __init__(self, flux: Flux, rng: np.random.Generator, model: QuantumModel | None = None, *, address: int = 1) -> None:
         self.unit = model or QuantumModel()
@@ -84,11 +85,17 @@ class QuantumSensor(Unit):
         self._saved = _FACTORY | _COEFFICIENTS | {16: float(address)}
         self._pending: dict[int, float] = {}
         self._measured = (-1, 0.0)
+        self._dazzled = False
 
     @property
     def address(self) -> int:
         """What it takes its address to be."""
         return round(self._saved[16])
+
+    def trouble(self, t: float, kind: str, rng: np.random.Generator) -> str | None:
+        """Have the next measurement end at full scale; see `sim.troubles`."""
+        self._dazzled = True
+        return "the next measurement ends at full scale"
 
     def read_holding(self, t: float, address: int, count: int) -> Sequence[int]:
         """Return registers, floats as two words and whole numbers as one."""
@@ -153,5 +160,7 @@ class QuantumSensor(Unit):
         if ended > self._measured[0]:
             begin, end = (ended - 1) * self.unit.period, ended * self.unit.period
             flux = self._flux(begin, end) + float(self._rng.normal(0.0, self.unit.noise)) if ended > 0 else 0.0
+            if self._dazzled and ended > 0:
+                self._dazzled, flux = False, math.inf
             self._measured = ended, min(flux, self.unit.full_scale)
         return self._measured[1]

@@ -26,6 +26,7 @@ OK, WEAK, CRITICAL = 0, 1, 2
 FACTORY_RESET, ZERO_TEACH, RESET_TIME = 503, 185, 1000
 _WRITE_ONLY = {ZERO_TEACH: 1, FACTORY_RESET: 1, 1000: 1, 1001: 1, 1002: 1, 1003: 1}
 _TAGS = (1050, 1066, 1082)
+_TELL_DISTANCE = ((200, 13), (202, 2))
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,7 @@ class DistanceSensor(Unit):
     """
 
     functions = frozenset({2, 3, 4, 6, 16})
+    troubles = ("alarm", "over-range")
 
     def __init__(self, distance: Distance, rng: np.random.Generator, model: RangeModel | None = None) -> None:
         self.unit = model or RangeModel()
@@ -95,6 +97,7 @@ class DistanceSensor(Unit):
         self._settings = self._factory()
         self._tags = {address: [0] * 16 for address in _TAGS}
         self._reset_time = 0.0
+        self._blind = False
 
     def _factory(self) -> dict[int, list[int]]:
         """Return every readable parameter by its first register, as delivered."""
@@ -108,6 +111,14 @@ class DistanceSensor(Unit):
             | {address: _long(value) for address, value in longs.items()}
         )
 
+    def trouble(self, t: float, kind: str, rng: np.random.Generator) -> str | None:
+        """Dirty the window, until `quality` is put back, or have the next distance asked for be none; see `sim.troubles`."""
+        if kind == "alarm":
+            self.quality = CRITICAL
+            return "quality critical, alarm on"
+        self._blind = True
+        return "the next distance asked for is none"
+
     # Tables
 
     def read_discrete(self, t: float, address: int, count: int) -> Sequence[bool]:
@@ -119,7 +130,9 @@ class DistanceSensor(Unit):
 
     def read_input(self, t: float, address: int, count: int) -> Sequence[int]:
         """Return one parameter whole, or the block of all measurements."""
-        block = self._measured(t)
+        blind = self._blind and (address, count) in _TELL_DISTANCE
+        block = self._measured(t, blind)
+        self._blind = self._blind and not blind
         if (address, count) == (200, len(block)):
             return block
         inputs: dict[int, list[int]] = {
@@ -214,14 +227,16 @@ class DistanceSensor(Unit):
                 return _Measurement(number, distance, distance, end)
         return _Measurement(number, None, last.held, last.since)
 
-    def _measured(self, t: float) -> list[int]:
-        """Return the thirteen registers from 200 on."""
+    def _measured(self, t: float, blind: bool = False) -> list[int]:
+        """Return the thirteen registers from 200 on; those of a target long lost if blind."""
         self._last = last = self._measure(t)
         period = 1 / self.unit.rate
         told, quality = last.distance, self.quality
         if told is None:
             quality = CRITICAL
             told = last.held if t - last.since <= self._settings[800][0] / 1000 else math.nan
+        if blind:
+            told, quality = math.nan, CRITICAL
         told -= _as_float(self._settings[180])
         near, far = _as_float(self._settings[300]), _as_float(self._settings[302])
         outputs = int(near <= told <= far) | int(quality == CRITICAL) << 1

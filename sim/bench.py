@@ -2,6 +2,11 @@
 
 Its forward kinematics are its own: theta_i = source stage - 90 deg + misalignment, theta_r = detector stage - 100 deg + misalignment, both
 positive towards +x and seen from the specimen's normal. The stages' readings know nothing of the misalignments, nor of the ringing.
+
+Every light sensor sees the same light, each in its own unit: the picoammeter the photodiode's current; a luminance meter beside the diode,
+on the same patch and arm, the patch's radiance times `Lamp.efficacy`; a camera there the radiance itself; a quantum sensor beside the
+specimen, facing the lamp, the irradiance times `Lamp.photons`. Both factors stand for the spectrum of a white light-emitting diode, at
+every angle and on every specimen.
 """
 
 from __future__ import annotations
@@ -117,19 +122,25 @@ class Lamp:
     Parameters
     ----------
     irradiance : float
-        W/m^2; the default makes the default photodiode give 1000 nA for a white Lambertian at theta_i = 45 deg.
+        W/m^2, all of it visible; the default makes the default photodiode give 1000 nA for a white Lambertian at theta_i = 45 deg.
     trend : float
         Steady drift, fraction per hour.
     flicker : float
         rms of the slow wandering, as a fraction. Its power per octave is the same from 4 s to 2.3 h (1/f).
     phases : tuple of float
         One per octave, rad.
+    efficacy : float
+        Luminous efficacy of the light, lm/W.
+    photons : float
+        In the light, umol/J.
     """
 
     irradiance: float = 5 * math.sqrt(2) * math.pi
     trend: float = 0.0
     flicker: float = 0.0
     phases: tuple[float, ...] = ()
+    efficacy: float = 300.0
+    photons: float = 4.6
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Lamp:
@@ -193,6 +204,30 @@ Angle = Callable[[float], float]
 """True mechanical angle of a stage, deg, at a simulated time, s."""
 
 
+@dataclass(frozen=True)
+class Plate:
+    """The matt plate beside the bench that both range finders look at, on a carriage that takes it away from them.
+
+    Parameters
+    ----------
+    position : callable
+        True position of the carriage, mm, at a simulated time, s.
+    front : float
+        From the front of the one sensor to the plate with the carriage at 0, mm. For the other, that is the start of its measuring range.
+    """
+
+    position: Callable[[float], float]
+    front: float = 60.0
+
+    def from_front(self, t0: float, t1: float) -> float:
+        """Return the distance from the sensor's front midway between two times, mm."""
+        return self.front + self.position((t0 + t1) / 2)
+
+    def from_start(self, t0: float, t1: float) -> float:
+        """Return the distance from the start of the measuring range midway between two times, mm."""
+        return self.position((t0 + t1) / 2)
+
+
 @dataclass
 class Bench:
     """The world the instruments share.
@@ -244,8 +279,12 @@ class Bench:
             current[lit] = self.scale * self.specimen.f_r(incidence, view) * np.cos(np.radians(incidence))
         return current
 
-    def signal(self, t0: float, t1: float) -> float:
-        """Return the mean current between two times, s, with noise, A; the arms may move meanwhile.
+    def truth(self, theta_i: Any, theta_r: Any) -> Floats:
+        """Return `light` with the arms at these nominal angles, which is where their stages say they stand."""
+        return self.light(np.add(theta_i, self.misalignment.source), np.add(theta_r, self.misalignment.detector))
+
+    def photocurrent(self, t0: float, t1: float) -> float:
+        """Return the mean current between two times, s, without dark current and noise, A; the arms may move meanwhile.
 
         Raises
         ------
@@ -258,9 +297,36 @@ class Bench:
         count = min(256, max(4, math.ceil((t1 - t0) / 0.0025)))
         times = t0 + (np.arange(count) + 0.5) * (t1 - t0) / count
         angles = np.array([self.angles(t) for t in times])
-        light = float(np.mean(self.light(angles[:, 0], angles[:, 1]))) * self.lamp.level((t0 + t1) / 2)
-        current = light + self.photodiode.dark
+        return float(np.mean(self.light(angles[:, 0], angles[:, 1]))) * self.lamp.level((t0 + t1) / 2)
+
+    def signal(self, t0: float, t1: float) -> float:
+        """Return what comes out of the photodiode: the mean current between two times, s, with dark current and noise, A.
+
+        Raises
+        ------
+        SimError
+            As `photocurrent`.
+        """
+        current = self.photocurrent(t0, t1) + self.photodiode.dark
         return current + float(self.rng.normal(0.0, self.photodiode.noise(current, t1 - t0)))
+
+    @property
+    def radiance_per_ampere(self) -> float:
+        """Radiance of the patch over the photocurrent it gives, W/(m^2 sr A)."""
+        diode = self.photodiode
+        return 1 / (diode.patch * diode.solid_angle * diode.responsivity)
+
+    def radiance(self, t0: float, t1: float) -> float:
+        """Return the mean radiance of the patch, seen along the detector's arm between two times, s, without noise, W/(m^2 sr)."""
+        return self.radiance_per_ampere * self.photocurrent(t0, t1)
+
+    def luminance(self, t0: float, t1: float) -> float:
+        """Return the mean luminance of the patch, seen along the detector's arm between two times, s, without noise, cd/m^2."""
+        return self.lamp.efficacy * self.radiance(t0, t1)
+
+    def photon_flux(self, t0: float, t1: float) -> float:
+        """Return the mean photon flux density from the lamp at normal incidence between two times, s, without noise, umol/(m^2 s)."""
+        return self.lamp.irradiance * self.lamp.photons * self.lamp.level((t0 + t1) / 2)
 
 
 def _wrapped(angle: float) -> float:

@@ -171,6 +171,7 @@ class Keithley6485:
     """
 
     model = "keithley-6485"
+    troubles = ("over-range",)
 
     def __init__(
         self, clock: Clock, signal: Signal, rng: np.random.Generator, model: MeterModel | None = None, name: str = "meter"
@@ -185,6 +186,7 @@ class Keithley6485:
         self._correction = 0.0
         self._filtered: deque[float] = deque(maxlen=100)
         self._readings: tuple[_Reading, ...] = ()
+        self._dazzled = False
         self._errors: deque[int] = deque()
         self._events = 0x80  # power on
         self._masks = {"*ESE": 0, "*SRE": 0}
@@ -228,6 +230,11 @@ class Keithley6485:
             if answer is not None:
                 line.write(answer + _TERMINATORS[self.meter.terminator])
                 await line.drain()
+
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Have the next reading of the input overflow, on whatever range; see `sim.troubles`."""
+        self._dazzled = True
+        return "the next reading of the input overflows"
 
     # Language
 
@@ -526,6 +533,8 @@ class Keithley6485:
         state = self._state
         await self._clock.sleep(state.trigger_delay)
         value = await self._ranged()
+        if self._dazzled and not state.zero_check:
+            self._dazzled, value = False, math.inf
         if state.filter and value != math.inf:
             if state.filter_control == "REP":
                 self._filtered.clear()

@@ -88,6 +88,8 @@ class Photometer:
         Of the port.
     """
 
+    troubles = ("alarm", "over-range")
+
     def __init__(
         self,
         clock: Clock,
@@ -102,11 +104,20 @@ class Photometer:
         self.unit = model or PhotometerModel()
         self.model = "konica-minolta-cs-100a" if self.unit.colour else "konica-minolta-ls-100"
         self.remote = True
+        self._dazzled = False
         self.battery_low = self.eeprom_fault = False
         self._clock, self._signal, self._chroma, self._rng = clock, signal, chroma, rng
         self._varied = self._fast = False
         self._peak: float | None = None
         self._turn = asyncio.Lock()
+
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Run the battery down, until `battery_low` is put back, or have the next measurement go over; see `sim.troubles`."""
+        if kind == "alarm":
+            self.battery_low = True
+            return "the battery is low"
+        self._dazzled = True
+        return "the next measurement goes over"
 
     async def serve(self, line: Line) -> None:
         """Answer commands on `line`, one after another, until the client has gone."""
@@ -158,6 +169,8 @@ class Photometer:
         luminance = self._signal(begin, end) * (1 + float(self._rng.normal(0.0, spread))) * (unit.varied if self._varied else 1.0)
         if self._peak is not None:
             self._peak = luminance = max(self._peak, luminance)
+        if self._dazzled:
+            self._dazzled, luminance = False, math.inf
         if not unit.colour:
             return b"ER10" if luminance > unit.highest else f"OK00,{_digits(max(luminance, 0.0)):>8}".encode("ascii")
         if luminance > unit.highest:

@@ -10,8 +10,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from sim.clock import Clock
 from sim.errors import SimError
+from sim.troubles import TROUBLES
 from sim.wire import Line
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, FAILURE, BUSY = 1, 2, 3, 4, 6
@@ -51,6 +54,12 @@ class Unit:
 
     functions: frozenset[int] = frozenset()
     """Function codes it knows, out of 2, 3, 4, 6, 8, 16 and 23."""
+    troubles: tuple[str, ...] = ()
+    """What can go wrong inside it; see `sim.troubles`."""
+
+    def trouble(self, t: float, kind: str, rng: np.random.Generator) -> str | None:
+        """Do one of `troubles` and say so, or return None while there is no opportunity."""
+        return None
 
     def read_discrete(self, t: float, address: int, count: int) -> Sequence[bool]:
         """Return `count` inputs."""
@@ -152,6 +161,20 @@ class ModbusBus:
         self.units = dict(units)
         self._clock = clock
         self._turnaround_s = turnaround_s
+
+    @property
+    def troubles(self) -> tuple[str, ...]:
+        """What can go wrong inside one or the other device."""
+        return tuple(kind for kind in TROUBLES if any(kind in unit.troubles for unit in self.units.values()))
+
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Do one of `troubles` to a drawn device; see `sim.troubles`."""
+        able = [address for address, unit in self.units.items() if kind in unit.troubles]
+        for place in rng.permutation(len(able)):
+            told = self.units[able[place]].trouble(self._clock.now(), kind, rng)
+            if told is not None:
+                return f"device {able[place]}: {told}"
+        return None
 
     async def serve(self, line: Line) -> None:
         """Answer requests on `line` until the client has gone."""

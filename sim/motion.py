@@ -91,6 +91,24 @@ class Profile:
             left -= duration
         return position, 0.0
 
+    def reach(self, begin: float, end: float) -> tuple[float, float]:
+        """Return the lowest and the highest position between two times, exactly: each piece is a parabola, whose turning point is known."""
+        positions = [self.at(begin)[0], self.at(end)[0]]
+        position, velocity, start = self.position, self.velocity, self.start
+        for duration, acceleration in self.segments:
+            if start >= end:
+                break
+            turn = -velocity / acceleration if acceleration else 0.0
+            for since in (0.0, turn):
+                if 0 <= since <= duration and begin <= start + since <= end:
+                    positions.append(position + (velocity + acceleration * since / 2) * since)
+            if duration == math.inf:
+                break
+            position += (velocity + acceleration * duration / 2) * duration
+            velocity += acceleration * duration
+            start += duration
+        return min(positions), max(positions)
+
     @property
     def brake_time(self) -> float:
         """How long the last braking takes, s."""
@@ -138,6 +156,7 @@ class Ringing:
 class _Move:
     profile: Profile
     until: float = math.inf  # when another motion took over
+    before: tuple[float, float] = (math.inf, -math.inf)  # lowest and highest position of all earlier motions
 
 
 class Track:
@@ -156,7 +175,7 @@ class Track:
         How long past motions are remembered, s.
     """
 
-    def __init__(self, position: float, ringing: Ringing, memory: float = 600.0) -> None:
+    def __init__(self, position: float, ringing: Ringing, memory: float = 3600.0) -> None:
         self.ringing = ringing
         self._memory = memory
         # A tuple, replaced and never changed, so that another thread may look at the track at any time.
@@ -175,10 +194,41 @@ class Track:
         SimError
             `t` lies before what is remembered.
         """
+        return self._at(t).profile.at(t)
+
+    def _at(self, t: float) -> _Move:
         for move in reversed(self._moves):
             if t >= move.profile.start:
-                return move.profile.at(t)
+                return move
         raise SimError(f"axis asked where it was at {t:.3f} s; it remembers {self._moves[0].profile.start:.3f} s and later")
+
+    def moving(self, t: float) -> bool:
+        """Tell whether a motion was under way at time `t`; the ringing afterwards does not count."""
+        return t < self._at(t).profile.end
+
+    def reach(self, t: float, since: float | None = None) -> tuple[float, float]:
+        """Return the lowest and the highest nominal position up to time `t`, exactly.
+
+        Parameters
+        ----------
+        t : float
+            What was planned for later, and may yet be changed, does not count.
+        since : float, optional
+            Look no further back than this, s; otherwise to the beginning, however long ago.
+
+        Raises
+        ------
+        SimError
+            `t` or `since` lies before what is remembered.
+        """
+        move = self._at(t)
+        if since is None or since <= 0:
+            low, high = move.profile.reach(move.profile.start, t)
+            return min(low, move.before[0]), max(high, move.before[1])
+        self._at(since)
+        kept = [move for move in self._moves if move.profile.start <= t and move.until >= since]
+        ends = [move.profile.reach(max(since, move.profile.start), min(t, move.until)) for move in kept]
+        return min(low for low, _ in ends), max(high for _, high in ends)
 
     def mechanical(self, t: float) -> float:
         """Return the true position of the mechanics at time `t`, ringing included."""
@@ -191,8 +241,11 @@ class Track:
         return position
 
     def begin(self, t: float, segments: Segments) -> None:
-        """Start a motion at time `t` from the nominal position and velocity, whatever was going on."""
+        """Start a motion at time `t` from the nominal position and velocity, whatever was going on; `t` may lie ahead.
+
+        What was planned to start later than that is dropped.
+        """
         position, velocity = self.nominal(t)
-        past = (*self._moves[:-1], replace(self._moves[-1], until=t))
-        kept = tuple(move for move in past if move.until >= t - self._memory)
-        self._moves = (*kept, _Move(Profile(t, position, velocity, segments)))
+        *past, current = (move for move in self._moves if move.profile.start <= t)
+        kept = tuple(move for move in (*past, replace(current, until=t)) if move.until >= t - self._memory)
+        self._moves = (*kept, _Move(Profile(t, position, velocity, segments), before=self.reach(t)))

@@ -14,12 +14,15 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from sim import motion
 from sim.clock import Clock
 from sim.errors import SimError
+from sim.troubles import cut_short
 from sim.wire import Line, Splitter
 
 LONGEST_MESSAGE = 256
@@ -163,9 +166,12 @@ class Axis:
         """Take note of what ended by time `t`: a homing, or a motion onto a limit switch, whose error code is returned."""
         if t < self.track.end:
             return None
-        if self._homing is not None:
-            self._zero, self._homing, self._target = self._homing, None, 0.0
         ended, self._ends_with = self._ends_with, None
+        if self._homing is not None and ended is None:
+            self._zero, self._target = self._homing, 0.0
+        self._homing = None
+        if ended == 3:
+            self.power = False
         return ended
 
     def busy(self, t: float) -> bool:
@@ -254,6 +260,12 @@ class Axis:
         self._begin(t, motion.to_rest(self.track.nominal(t)[1], self.settings[deceleration]))
         return aborted
 
+    def halt(self, t: float, stalls: bool, rng: np.random.Generator) -> tuple[float, int]:
+        """Plan that the motion under way ends dead, stalled and without power or on a limit switch; return where and the error."""
+        halted, velocity = cut_short(self.track, t, rng)
+        self._ends_with = 3 if stalls else 4 if velocity > 0 else 5
+        return halted - self._zero, self._ends_with
+
     def define(self, t: float, deg: float) -> None:
         """Call the present position `deg`: `DH`."""
         self._zero = self.track.nominal(t)[0] - deg
@@ -261,6 +273,8 @@ class Axis:
 
 class Esp301:
     """A controller with a stage on each of its axes 1 to N.
+
+    `on_stop`, where set, is told each axis that `ST` or `AB` speaks to.
 
     Parameters
     ----------
@@ -277,6 +291,7 @@ class Esp301:
     """
 
     model = "newport-esp301"
+    troubles = ("alarm", "stall", "limit-hit")
 
     def __init__(
         self,
@@ -290,6 +305,7 @@ class Esp301:
             raise SimError(f"a controller of {len(angles)} axes: expected 1 to {MOST_AXES}")
         self.name = name
         self.axes = tuple(Axis(stage or EspStage(), angle) for angle in angles)
+        self.on_stop: Callable[[str], None] | None = None
         self._version = version
         self._clock = clock
         self._power_on = clock.now()
@@ -318,6 +334,19 @@ class Esp301:
         broken.track.begin(now, ())
         broken.power = False
         self._record(axis * 100 + error)
+
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Let the amplifier of a drawn axis fail, or have an axis that moves halt; see `sim.troubles`."""
+        now = self._clock.now()
+        numbers = [number for number, axis in enumerate(self.axes, 1) if kind == "alarm" or axis.busy(now)]
+        if not numbers:
+            return None
+        number = numbers[int(rng.integers(len(numbers)))]
+        if kind == "alarm":
+            self.fail(number, 2)
+            return f"axis {number}: error {number * 100 + 2}, motor off"
+        where, error = self.axes[number - 1].halt(now, kind == "stall", rng)
+        return f"axis {number} halts at {where:.4f} deg: error {number * 100 + error}"
 
     def emergency(self) -> None:
         """Press the red button: every axis brakes hard and loses its motor power, and error 4 is left."""
@@ -384,9 +413,14 @@ class Esp301:
                 return self._version
             case ("AB", ""):
                 for number, axis in enumerate(self.axes, 1):
-                    self._stopped(number, axis.stop(now, "AE"))
+                    self._stop(number, axis, now, "AE")
                 return None
         raise _Error(7)
+
+    def _stop(self, number: int, axis: Axis, now: float, deceleration: str) -> None:
+        self._stopped(number, axis.stop(now, deceleration))
+        if self.on_stop is not None:
+            self.on_stop(str(number))
 
     def _stopped(self, number: int, error: int | None) -> None:
         if error is not None:
@@ -463,9 +497,9 @@ class Esp301:
                     raise _AxisError(1)
                 axis.home(now, int(search))
             case "ST":
-                self._stopped(number, axis.stop(now))
+                self._stop(number, axis, now, "AG")
             case "AB":
-                self._stopped(number, axis.stop(now, "AE"))
+                self._stop(number, axis, now, "AE")
             case "DH":
                 axis.define(now, _number(data or "0") * axis.per_unit)
             case "SN":

@@ -101,6 +101,7 @@ class OptoNCDT:
     """
 
     model = "micro-epsilon-ild1420"
+    troubles = ("over-range",)
 
     def __init__(
         self, clock: Clock, distance: Distance, rng: np.random.Generator, model: TriangulationModel | None = None, name: str = "range"
@@ -110,6 +111,7 @@ class OptoNCDT:
         self._clock, self._distance, self._rng = clock, distance, rng
         self.professional = True
         self._streaming = asyncio.Event()
+        self._lost = 0
         self._power_up()
 
     def _power_up(self) -> None:
@@ -140,6 +142,11 @@ class OptoNCDT:
             if not stream.cancelled():
                 stream.result()  # whatever it failed of comes out here
 
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Have the next values, 1 to 50 of them, be the error word; see `sim.troubles`."""
+        self._lost = int(rng.integers(1, 51))
+        return f"the next {self._lost} values are errors"
+
     async def _reply(self, line: Line, text: str) -> None:
         line.write(text.encode("ascii") + (b"\r\n" if text else b"") + PROMPT)
         await line.drain()
@@ -163,6 +170,9 @@ class OptoNCDT:
 
     def _word(self, begin: float, end: float) -> int:
         distance = self._distance(begin, end)
+        if self._lost:
+            self._lost -= 1
+            return self.unit.no_target
         if distance is None:
             return self.unit.no_target
         relative = (distance + float(self._rng.normal(0.0, self.unit.noise))) / self.unit.measuring_range

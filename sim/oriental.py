@@ -12,12 +12,15 @@ the operation data. The position sensor sits on the motor, so that the ringing o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from sim import motion
 from sim.errors import SimError
 from sim.modbus import FAILURE, ILLEGAL_ADDRESS, ILLEGAL_VALUE, Refusal, Unit
+from sim.troubles import cut_short
 
 # Inputs of 0x007D and outputs of 0x007F as delivered. Source: sheet 4.3 and 4.4.
 START, ZHOME, STOP, FREE, ALM_RST, SSTART, FW_POS, RV_POS = (1 << bit for bit in (3, 4, 5, 6, 7, 11, 14, 15))
@@ -27,6 +30,7 @@ NOT_RESETTABLE = frozenset({0x20, 0x22, 0x28, 0x2A, 0x33, 0x41, 0x42, 0x43, 0x44
 """Alarms that only a power cycle clears. Source: sheet 4.6, from one reading of the manual."""
 
 NO_ORIGIN, SOFTWARE_OVERTRAVEL, OPERATION_DATA = 0x4A, 0x67, 0x70
+_TROUBLES = {"alarm": (0x22, 0x25, 0x26, 0x28, 0x31), "stall": (0x10, 0x30), "limit-hit": (0x60, 0x66)}
 
 _INPUT, _INPUT_PULSE, _OUTPUT, _ALARM, _HISTORY, _COMM_ERROR = 0x7C, 0x78, 0x7E, 0x80, 0x82, 0xAC
 _COMMAND_POSITION, _POSITION, _SPEED_RPM, _SPEED_HZ, _TORQUE = (0xC6, 0x120), (0xCC, 0x122), 0xCE, 0xD0, 0xD6
@@ -128,13 +132,18 @@ def to_target(position: float, velocity: float, target: float, speed: float, rat
 
 
 class AzAxis(Unit):
-    """One AZ driver with its actuator; the true angle of the table is in `track` (degrees, zero at the origin)."""
+    """One AZ driver with its actuator; the true angle of the table is in `track` (degrees, zero at the origin).
+
+    `on_stop`, where set, is called at each input word with STOP in it.
+    """
 
     functions = frozenset({3, 6, 8, 16, 23})
+    troubles = tuple(_TROUBLES)
 
     def __init__(self, model: AzModel, angle: float) -> None:
         self.model = model
         self.track = motion.Track(angle, model.ringing)
+        self.on_stop: Callable[[], None] | None = None
         self._scale = model.steps_per_turn / 360
         self._cells = {_FORWARD: 0, _TRIGGER: 0, _INPUT: 0, _PRESET_VALUE: 0, _ALARM_RESET: 0, _CLEAR_HISTORY: 0, _PRESET: 0}
         self._cells |= dict.fromkeys(_QUIET_COMMANDS, 0)
@@ -166,6 +175,19 @@ class AzAxis(Unit):
         self._history = [code, *self._history][:10]
         self._homing = False
         self._fails_on_arrival = 0
+
+    def trouble(self, t: float, kind: str, rng: np.random.Generator) -> str | None:
+        """Raise a drawn alarm, now or at the place where the motion under way is cut short; see `sim.troubles`."""
+        code = _TROUBLES[kind][int(rng.integers(len(_TROUBLES[kind])))]
+        self.update(t)
+        if kind == "alarm":
+            self.fail(t, code)
+            return f"alarm {code:02X}h"
+        if not self.busy(t):
+            return None
+        halted, _ = cut_short(self.track, t, rng)
+        self._homing, self._fails_on_arrival = False, code
+        return f"halts at {round((halted - self._zero) * self._scale)} steps: alarm {code:02X}h"
 
     def busy(self, t: float) -> bool:
         """Tell whether the axis is moving; the ringing afterwards does not count."""
@@ -240,6 +262,8 @@ class AzAxis(Unit):
 
     def _act(self, t: float, cell: int, old: int, value: int, low_word: bool) -> None:
         rises = value == 1 and old != 1
+        if cell in (_INPUT, _INPUT_PULSE) and low_word and value & STOP and self.on_stop is not None:
+            self.on_stop()
         if cell == _TRIGGER and low_word and value:
             self._trigger(t, value)
         elif cell == _INPUT:

@@ -1,121 +1,109 @@
-"""Build the simulated bench and serve its instruments, in this process or in a thread beside it."""
+"""Serve the instruments of the simulated world, in this process or in a thread beside it."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
-import threading
+import shutil
+import tempfile
 from collections.abc import AsyncIterator, Iterator
-from concurrent.futures import Future
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import numpy as np
+from sim.camera import POLL, SHUTTER, SimulatedCamera
+from sim.errors import SimError
+from sim.faults import Fault, Strike
+from sim.wire import PtyPort, TcpPort, beside
+from sim.world import CAMERA, INSTRUMENTS, LINES, Settings, Stop, World, build
 
-from sim.bench import Bench, Lamp, Misalignment, specimen
-from sim.clock import Clock, SimClock
-from sim.keithley import Keithley6485, MeterModel
-from sim.wire import Instrument, PtyPort, TcpPort
-from sim.zaber import StageModel, ZaberChain
+__all__ = ["INSTRUMENTS", "Running", "Settings", "World", "build", "in_background", "serving"]
 
-SOURCE, DETECTOR = 1, 2
-"""Addresses of the two arms' stages in the chain."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What can be chosen about the simulated bench.
-
-    Parameters
-    ----------
-    specimen : str
-        Name of a virtual petal, or `lambert:ALBEDO`.
-    seed : int
-        Decides the angles at power-up, misalignments, drift, offset and noise.
-    speed : float
-        Simulated seconds per real second.
-    stage, meter
-        What the instruments are like.
-    misalignment : Misalignment or None
-        Of the arms; None draws it.
-    pty : bool
-        Serve on pseudo-terminals too.
-    """
-
-    specimen: str = "RR"
-    seed: int = 1
-    speed: float = 1.0
-    stage: StageModel = field(default_factory=StageModel)
-    meter: MeterModel = field(default_factory=MeterModel)
-    misalignment: Misalignment | None = None
-    pty: bool = True
-
-
-@dataclass(frozen=True)
-class World:
-    """The bench and the instruments on it."""
-
-    settings: Settings
-    clock: Clock
-    stages: ZaberChain
-    meter: Keithley6485
-    bench: Bench
-
-    @property
-    def instruments(self) -> tuple[Instrument, ...]:
-        """Everything that has a port."""
-        return self.stages, self.meter
-
-
-def build(settings: Settings, clock: Clock | None = None) -> World:
-    """Make the world of these settings; it starts at rest, unhomed, at simulated time zero.
-
-    Raises
-    ------
-    SimError
-        A setting makes no sense, or there is no such specimen.
-    """
-    clock = clock or SimClock(settings.speed)
-    # One stream of random numbers per part: a change to one does not reshuffle the others.
-    parked, aligned, lit, diode, meter = (np.random.default_rng(seed) for seed in np.random.SeedSequence(settings.seed).spawn(5))
-    stage = settings.stage
-    stages = ZaberChain(clock, [float(angle) for angle in parked.uniform(stage.limit_min, stage.limit_max, 2)], stage)
-    bench = Bench(
-        source=stages.axes[SOURCE - 1].track.mechanical,
-        detector=stages.axes[DETECTOR - 1].track.mechanical,
-        specimen=specimen(settings.specimen),
-        rng=diode,
-        lamp=Lamp.drawn(lit),
-        misalignment=settings.misalignment or Misalignment.drawn(aligned),
-    )
-    return World(settings, clock, stages, Keithley6485(clock, bench.signal, meter, settings.meter), bench)
+log = logging.getLogger(__name__)
 
 
 @asynccontextmanager
 async def serving(world: World) -> AsyncIterator[dict[str, Any]]:
     """Open every instrument's ports and yield the report that tells where they are; close them at the end."""
-    devices = []
+    devices: list[dict[str, str]] = []
     async with AsyncExitStack() as ports:
-        for instrument in world.instruments:
+        for name in world.settings.instruments:
+            if name == CAMERA:
+                devices.append(await ports.enter_async_context(_tethered(world)))
+                continue
+            instrument = world.faulty[name]
             tcp = TcpPort(instrument)
             await tcp.open()
             ports.push_async_callback(tcp.close)
-            device: dict[str, Any] = {"name": instrument.name, "model": instrument.model, "tcp": tcp.url}
+            device = {"name": name, "model": instrument.model, "description": INSTRUMENTS[name], "tcp": tcp.url}
             if world.settings.pty:
                 pty = PtyPort(instrument)
                 await pty.open()
                 ports.push_async_callback(pty.close)
                 device["pty"] = pty.path
+            device["line"] = LINES[name].format(terminator=world.settings.meter.terminator)
             devices.append(device)
         yield {
             "simulated": True,
             "seed": world.settings.seed,
             "speed": world.settings.speed,
             "specimen": world.settings.specimen,
+            **{arm: carried.axis for arm, carried in world.arms.items()},
             "pid": os.getpid(),
             "devices": devices,
         }
+
+
+@asynccontextmanager
+async def _tethered(world: World) -> AsyncIterator[dict[str, str]]:
+    """Let the camera wait for its shutter, and yield its part of the report; a folder made for it goes at the end."""
+    camera = world.camera
+    assert camera is not None
+    with _folder(world.settings.camera_folder) as camera.folder:
+        # OpenCV takes its time to load, and no instrument shall stand still at the first picture.
+        await asyncio.to_thread(camera.scene.draw, camera.model.width, camera.model.height)
+        waiting = asyncio.create_task(_take_pictures(camera))
+        try:
+            yield {"name": CAMERA, "model": "camera-folder", "description": INSTRUMENTS[CAMERA], "folder": str(camera.folder)}
+        finally:
+            waiting.cancel()
+            await asyncio.wait({waiting})
+
+
+async def _take_pictures(camera: SimulatedCamera) -> None:
+    # Not `camera.run()`: waiting for the shutter in simulated time would keep a core busy where that runs fast.
+    shutter = camera.folder / SHUTTER
+    try:
+        while True:
+            try:
+                shutter.unlink()
+            except FileNotFoundError:
+                await asyncio.sleep(POLL)
+            else:
+                await camera.shoot()
+    except Exception:  # it must be seen, and must not take the instruments down
+        log.exception("simulated camera failed; it takes no more pictures")
+
+
+@contextmanager
+def _folder(path: str | None) -> Iterator[Path]:
+    if path is None:
+        with tempfile.TemporaryDirectory(prefix="simulated-camera-") as made:
+            yield Path(made)
+    elif os.path.isdir(path):
+        yield Path(path).resolve()
+    else:
+        folder = Path(path).resolve()
+        try:
+            folder.mkdir(parents=True)
+        except OSError as error:
+            raise SimError(f"camera folder {path}: {error.strerror}") from error
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 @dataclass(frozen=True)
@@ -133,6 +121,28 @@ class Running:
         """Return the pseudo-terminal of the instrument `name`."""
         return self._device(name)["pty"]
 
+    def folder(self, name: str) -> Path:
+        """Return the folder of the camera `name`."""
+        return Path(self._device(name)["folder"])
+
+    def inject(self, name: str, fault: Fault) -> None:
+        """Have a fault strike the instrument `name`; from any thread.
+
+        Raises
+        ------
+        SimError
+            It knows no such fault.
+        """
+        self.world.faulty[name].inject(fault)
+
+    def struck(self, name: str) -> tuple[Strike, ...]:
+        """Return what faults did to the instrument `name` so far."""
+        return tuple(self.world.faulty[name].struck)
+
+    def stops(self) -> tuple[Stop, ...]:
+        """Return the stop commands that arrived so far."""
+        return self.world.stops.all()
+
     def _device(self, name: str) -> dict[str, str]:
         return next(device for device in self.report["devices"] if device["name"] == name)
 
@@ -147,24 +157,5 @@ def in_background(settings: Settings) -> Iterator[Running]:
         As `build`; whatever else keeps the servers from starting is raised here as well.
     """
     world = build(settings)
-    started: Future[tuple[dict[str, Any], asyncio.AbstractEventLoop, asyncio.Event]] = Future()
-
-    async def main() -> None:
-        stop = asyncio.Event()
-        try:
-            async with serving(world) as report:
-                started.set_result((report, asyncio.get_running_loop(), stop))
-                await stop.wait()
-        except BaseException as error:
-            if started.done():
-                raise
-            started.set_exception(error)
-
-    thread = threading.Thread(target=asyncio.run, args=(main(),), name="simulated bench", daemon=True)
-    thread.start()
-    report, loop, stop = started.result()
-    try:
+    with beside(serving(world), "simulated bench") as report:
         yield Running(report, world)
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join()

@@ -13,9 +13,12 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from sim import motion
 from sim.clock import Clock
 from sim.errors import SimError
+from sim.troubles import cut_short
 from sim.wire import Line, Splitter
 
 LONGEST_MESSAGE = 128
@@ -167,6 +170,12 @@ class Axis:
         if self.busy(t):
             self._begin(t, () if dead else motion.to_rest(self.track.nominal(t)[1], self.acceleration()))
 
+    def halt(self, t: float, rng: np.random.Generator) -> int:
+        """Plan that the motion under way ends dead on a limit sensor; return the count there."""
+        halted, _ = cut_short(self.track, t, rng)
+        self._homing, self._meets_limit = False, True
+        return round((halted - self._zero) / self.per_pulse)
+
     def zero(self, t: float) -> None:
         """Call the present position zero."""
         self._zero = self.track.nominal(t)[0]
@@ -179,7 +188,9 @@ class Axis:
 
 
 class SigmaKoki:
-    """A two-axis controller.
+    """A two-axis controller. It has no way to tell of a stall or an alarm.
+
+    `on_stop`, where set, is told each axis that `L:` speaks to.
 
     Parameters
     ----------
@@ -195,6 +206,8 @@ class SigmaKoki:
         Of the port.
     """
 
+    troubles = ("limit-hit",)
+
     def __init__(
         self, clock: Clock, angles: Sequence[float], kind: Kind = SHOT_302GS, stage: StageModel | None = None, name: str = "sigma"
     ) -> None:
@@ -203,6 +216,7 @@ class SigmaKoki:
         self.name = name
         self.model = kind.model
         self.axes = tuple(Axis(stage or StageModel(), angle) for angle in angles)
+        self.on_stop: Callable[[str], None] | None = None
         self._kind = kind
         self._clock = clock
         self._failed = False  # ACK1
@@ -221,6 +235,15 @@ class SigmaKoki:
         now = self._clock.now()
         self.axes[axis - 1].stop(now, dead=True)
         self.axes[axis - 1].on_limit = True
+
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Let an axis that moves touch a limit sensor on its way; see `sim.troubles`."""
+        now = self._clock.now()
+        numbers = [number for number, axis in enumerate(self.axes, 1) if axis.busy(now)]
+        if not numbers:
+            return None
+        number = numbers[int(rng.integers(len(numbers)))]
+        return f"axis {number} halts at {self.axes[number - 1].halt(now, rng)} pulses on a limit sensor"
 
     def answer(self, message: bytes) -> bytes | None:
         """Carry out one command; return its reply without the line end, or None."""
@@ -359,6 +382,8 @@ class SigmaKoki:
     def _stop(self, rest: str, now: float) -> None:
         for axis in self.axes if rest == "E" else self._chosen(rest):
             axis.stop(now, dead=rest == "E")
+            if self.on_stop is not None:
+                self.on_stop(str(self.axes.index(axis) + 1))
 
 
 def _signs(text: str, count: int) -> bool:

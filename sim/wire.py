@@ -1,7 +1,7 @@
 """The wire: an instrument served on a TCP socket and on a pseudo-terminal.
 
-An instrument sees only a `Line`, bytes in and bytes out. Faults are added by wrapping: a faulty line around a line, or an instrument that
-serves another instrument over such a line.
+An instrument sees only a `Line`, bytes in and bytes out. Faults are added by wrapping: `sim.faults.Faulty` is an instrument that serves
+another one over faulty lines.
 """
 
 from __future__ import annotations
@@ -12,14 +12,22 @@ import logging
 import os
 import select
 import socket
+import threading
 from collections.abc import Iterator
-from typing import Protocol
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager, contextmanager
+from typing import Protocol, TypeVar
 
 log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
 
 
 class Line(Protocol):
     """One client's connection, as the instrument sees it."""
+
+    hangs_up: bool
+    """Whether the client is hung up on when the instrument ceases to serve it; a terminal stays open."""
 
     async def read(self) -> bytes:
         """Wait for bytes from the client; empty when it has gone."""
@@ -93,6 +101,8 @@ async def _end(tasks: set[asyncio.Task[None]]) -> None:
 
 
 class _TcpLine:
+    hangs_up = True
+
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer
 
@@ -149,6 +159,8 @@ class TcpPort:
 
 class _PtyLine:
     """The master side of a pseudo-terminal while a client has the other side open."""
+
+    hangs_up = False
 
     def __init__(self, master: int) -> None:
         self._master = master
@@ -260,3 +272,32 @@ class PtyPort:
         if self._task is not None:
             await _end({self._task})
             os.close(self._master)
+
+
+@contextmanager
+def beside(context: AbstractAsyncContextManager[_T], name: str = "simulator") -> Iterator[_T]:
+    """Run an async context in an event loop and a thread of its own for the length of a `with` block.
+
+    Whatever keeps the context from being entered is raised here.
+    """
+    started: Future[tuple[_T, asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        try:
+            async with context as entered:
+                started.set_result((entered, asyncio.get_running_loop(), stop))
+                await stop.wait()
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
+    thread = threading.Thread(target=asyncio.run, args=(main(),), name=name, daemon=True)
+    thread.start()
+    entered, loop, stop = started.result()
+    try:
+        yield entered
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        thread.join()

@@ -1,9 +1,12 @@
-"""Simulated Zaber X-RSW rotary stages: a chain of one-axis devices that speak Zaber's ASCII protocol on one port.
+"""Simulated Zaber stages, rotary (X-RSW) or linear (X-LSM): a chain of one-axis devices that speak Zaber's ASCII protocol on one port.
 
 Source: Zaber ASCII Protocol Manual, as condensed in the project's protocol sheet, section 1. Points the sheet marks as unverified, and what
 is done here: device and peripheral ids (settable, the defaults are placeholders), the scale of `accel` (1.6384/10000 x usteps/s^2), a
 command with a bad checksum (ignored), device-scope settings asked for on an axis (DEVICEONLY), the position shown before homing (0), the
-flags shown before homing (settable), commands split over several packets (BADCOMMAND).
+flags shown before homing (settable), commands split over several packets (BADCOMMAND). Of linear
+stages, unverified: the microstep (settable, a usual size), `limit.cycle.dist` (BADCOMMAND, since nothing turns), and what happens at the
+end of the travel when there is no reference (the carriage stops there with FS). Of troubles, unverified: FS and FE are forgotten with
+`warnings clear` and leave the reference, and a disabled driver (FO) refuses motion until `driver enable` or `system reset`.
 
 The stages have no encoder: `pos` is the commanded microstep, and the ringing of the mechanics after a stop shows in `Axis.track` only.
 """
@@ -14,12 +17,16 @@ import asyncio
 import contextlib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
 
 from sim import motion
 from sim.clock import Clock
 from sim.errors import SimError
+from sim.troubles import cut_short
 from sim.wire import Line, Splitter
 
 VELOCITY_SCALE = 1.6384
@@ -32,7 +39,8 @@ LONGEST_PACKET = 80
 _FLAGS = tuple(
     "FF FN FZ FH FV FO FD FC FM FQ FI FA FR FS FB FP FE FT WL WV WT WS WM WP WR WH NC NI ND NR NT NU NJ NB".split(" ")  # noqa: SIM905
 )
-_CLEARABLE = frozenset({"NI"})
+_CLEARABLE = frozenset({"NI", "FS", "FE"})
+_TROUBLES = {"alarm": "FO", "stall": "FS", "limit-hit": "FE"}
 _NUMBER = re.compile(r"-?[0-9]{1,12}")
 _COUNT = re.compile(r"[0-9]+")
 
@@ -46,28 +54,70 @@ class _Reject(Exception):
     """The reason of an RJ reply. Source: sheet 1.4."""
 
 
-@dataclass(frozen=True)
-class StageModel:
-    """What a rotary stage is like; angles in degrees, speeds in deg/s.
+@dataclass(frozen=True, kw_only=True)
+class AxisModel:
+    """What is to be told of any stage; lengths in its unit, degrees or mm, speeds per second.
+
+    Parameters
+    ----------
+    limit_min, limit_max : float
+        Travel after homing.
+    speed, acceleration, top_speed : float
+        Defaults of `maxspeed` and `accel`, and the highest speed accepted, raised to `speed` if that is faster.
+    home_speed, creep_speed : float
+        Homing runs fast to just beside the index and creeps onto it.
+    ringing : Ringing
+        Of the mechanics.
+    device_id, peripheral_id, firmware, build
+        Identity. The numbers of real stages are unverified: these are placeholders.
+    unhomed_flags : tuple of str
+        Warning flags shown until homed. The protocol knows WR and WH; which of them, or both, is unverified.
+    """
+
+    name: ClassVar[str]
+    """Of the model, as in catalogues."""
+
+    limit_min: float
+    limit_max: float
+    speed: float
+    acceleration: float
+    top_speed: float
+    home_speed: float
+    creep_speed: float
+    ringing: motion.Ringing
+    device_id: int = 99_999
+    peripheral_id: int = 0
+    firmware: str = "7.30"
+    build: int = 1
+    unhomed_flags: tuple[str, ...] = ("WR",)
+
+    @property
+    def steps_per_unit(self) -> float:
+        """Microsteps per degree or mm at the default resolution of 64."""
+        raise NotImplementedError
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Where the mechanics end, true positions."""
+        return -math.inf, math.inf
+
+    def __post_init__(self) -> None:
+        positive = (self.steps_per_unit, self.speed, self.acceleration, self.top_speed, self.home_speed, self.creep_speed)
+        if not all(0 < number < math.inf for number in positive) or not self.limit_min < self.limit_max:
+            raise SimError(f"{self}: speeds, acceleration and microsteps must be above zero, and limit_min below limit_max")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageModel(AxisModel):
+    """A rotary stage, degrees; X-RSW60A class, 115 deg/s at most (X-RSW60A-E03).
 
     Parameters
     ----------
     steps_per_turn : int
-        Microsteps per turn at the default resolution of 64 (X-RSW60A class).
-    limit_min, limit_max : float
-        Travel after homing.
-    speed, acceleration, top_speed : float
-        Defaults of `maxspeed` and `accel`, and the highest speed accepted (115 deg/s for X-RSW60A-E03), raised to `speed` if that is
-        faster.
-    home_speed, creep_speed : float
-        Homing runs fast to just beside the index and creeps onto it.
-    device_id, peripheral_id, firmware, build
-        Identity. The numbers of real X-RSW stages are unverified: these are placeholders.
-    unhomed_flags : tuple of str
-        Warning flags shown until homed. The protocol knows WR and WH; which of them, or both, is unverified.
-    ringing : Ringing
-        Of the mechanics, degrees.
+        Microsteps per turn at the default resolution of 64.
     """
+
+    name: ClassVar[str] = "zaber-x-rsw60a"
 
     steps_per_turn: int = 1_536_000
     limit_min: float = 0.0
@@ -77,36 +127,73 @@ class StageModel:
     top_speed: float = 115.0
     home_speed: float = 30.0
     creep_speed: float = 2.0
-    device_id: int = 99_999
-    peripheral_id: int = 0
-    firmware: str = "7.30"
-    build: int = 1
-    unhomed_flags: tuple[str, ...] = ("WR",)
     ringing: motion.Ringing = field(default_factory=motion.Ringing)
 
+    @property
+    def steps_per_unit(self) -> float:
+        """Microsteps per degree."""
+        return self.steps_per_turn / 360
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearModel(AxisModel):
+    """A linear stage, mm; X-LSM class. All numbers are usual ones, and unverified.
+
+    Parameters
+    ----------
+    microstep : float
+        um in a microstep at the default resolution of 64.
+    slack : float
+        The carriage meets its ends so far beyond the travel, mm.
+    """
+
+    name: ClassVar[str] = "zaber-x-lsm"
+
+    microstep: float = 0.047625
+    limit_min: float = 0.0
+    limit_max: float = 150.0
+    speed: float = 20.0
+    acceleration: float = 200.0
+    top_speed: float = 104.0
+    home_speed: float = 20.0
+    creep_speed: float = 2.0
+    slack: float = 0.5
+    ringing: motion.Ringing = field(default_factory=lambda: motion.Ringing(amplitude=0.002))
+
     def __post_init__(self) -> None:
-        positive = (self.steps_per_turn, self.speed, self.acceleration, self.top_speed, self.home_speed, self.creep_speed)
-        if not all(0 < number < math.inf for number in positive) or not self.limit_min < self.limit_max:
-            raise SimError(f"{self}: speeds, acceleration and microsteps must be above zero, and limit_min below limit_max")
+        if not 0 < self.microstep < math.inf or self.slack < 0:
+            raise SimError(f"{self}: expected a microstep above zero, and slack that is not below")
+        super().__post_init__()
+
+    @property
+    def steps_per_unit(self) -> float:
+        """Microsteps per mm."""
+        return 1000 / self.microstep
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Where the carriage meets its ends, mm from the home sensor."""
+        return self.limit_min - self.slack, self.limit_max + self.slack
 
 
 class Axis:
-    """One rotary axis: counter, settings, flags, and the true angle of its arm in `track` (degrees, zero at the index)."""
+    """One axis: counter, settings, flags, and the true position of its arm or carriage in `track` (degrees or mm, zero at the index)."""
 
-    def __init__(self, model: StageModel, angle: float) -> None:
+    def __init__(self, model: AxisModel, position: float) -> None:
         self._model = model
-        self.track = motion.Track(angle, model.ringing)
+        self.track = motion.Track(position, model.ringing)
         self.flags: set[str] = set()
-        self._zero = angle  # where the counter reads zero
+        self._zero = position  # where the counter reads zero
         self._homing = False
         self._referenced = False
         self._tells_arrival = False
-        scale = model.steps_per_turn / 360
+        self._ends_with: str | None = None  # flag that the motion under way will end in
+        scale = model.steps_per_unit
         self.settings = {
             "limit.min": round(model.limit_min * scale),
             "limit.max": round(model.limit_max * scale),
             "limit.home.pos": 0,
-            "limit.cycle.dist": model.steps_per_turn,
+            **({"limit.cycle.dist": model.steps_per_turn} if isinstance(model, StageModel) else {}),
             "maxspeed": round(model.speed * scale * VELOCITY_SCALE),
             "accel": round(model.acceleration * scale * ACCELERATION_SCALE),
             "resolution": 64,
@@ -118,8 +205,8 @@ class Axis:
 
     @property
     def _scale(self) -> float:
-        """Microsteps per degree."""
-        return self.settings["limit.cycle.dist"] / 360
+        """Microsteps per degree or mm."""
+        return self._model.steps_per_unit * self.settings["resolution"] / 64
 
     def power_up(self, t: float) -> None:
         """Forget the reference; the arm brakes and stays where it is, and the counter reads 0 there."""
@@ -127,10 +214,14 @@ class Axis:
             self.track.begin(t, motion.to_rest(self.track.nominal(t)[1], self._acceleration()))
         self._zero = self.track.nominal(max(t, self.track.end))[0]
         self._homing = self._referenced = self._tells_arrival = False
+        self._ends_with = None
         self.flags = set(self._model.unhomed_flags)
 
     def update(self, t: float) -> None:
-        """Take note of a homing completed by time `t`."""
+        """Take note of what ended by time `t`: a homing, or a motion that was halted."""
+        if self._ends_with is not None and t >= self.track.end:
+            self.flags.add(self._ends_with)
+            self._ends_with = None
         if self._homing and t >= self.track.end:
             self._homing, self._referenced = False, True
             self._zero = -self.settings["limit.home.pos"] / self._scale
@@ -169,9 +260,29 @@ class Axis:
     def _begin(self, t: float, segments: motion.Segments) -> None:
         if self.busy(t):
             self.flags.add("NI")
-        self._homing = False
+        self._homing, self._ends_with = False, None
         self.track.begin(t, segments)
         self._tells_arrival = True
+
+    def halt(self, t: float, flag: str, rng: np.random.Generator) -> float:
+        """Plan that the motion under way ends dead and shows `flag`, a stall or a limit sensor; return the position, microsteps."""
+        halted, _ = cut_short(self.track, t, rng)
+        self._homing, self._ends_with = False, flag
+        return round((halted - self._zero) * self._scale)
+
+    def disable(self, t: float) -> None:
+        """Take the current from the motor: the axis stops dead and refuses motion."""
+        if self.busy(t):
+            self._begin(t, ())
+        self.flags.add("FO")
+
+    def enable(self) -> None:
+        """Give the motor its current again: `driver enable`."""
+        self.flags.discard("FO")
+
+    def _enabled(self) -> None:
+        if "FO" in self.flags:
+            raise _Reject("DRIVERDISABLED")
 
     def stop(self, t: float) -> None:
         """Brake to rest: `stop`."""
@@ -179,6 +290,7 @@ class Axis:
 
     def home(self, t: float) -> None:
         """Find the index: `home`."""
+        self._enabled()
         position, velocity = self.track.nominal(t)
         creep = self._speed(round(self._model.creep_speed * self._scale * VELOCITY_SCALE))
         fast = min(self._model.home_speed, self._speed(self.settings["maxspeed"]))
@@ -192,7 +304,7 @@ class Axis:
         Raises
         ------
         _Reject
-            BADDATA for a target beyond the limits, an absolute target without reference, or data out of range.
+            BADDATA for a target beyond the limits, an absolute target without reference, or data out of range; DRIVERDISABLED.
         """
         takes = {"abs": 1, "rel": 1, "vel": 1, "max": 0, "min": 0}.get(kind)
         if takes is None:
@@ -201,6 +313,7 @@ class Axis:
         if not takes <= len(arguments) <= takes + optional:
             raise _Reject("BADCOMMAND" if len(arguments) > takes + optional else "BADDATA")
         data = [_integer(word) for word in arguments]
+        self._enabled()
         extras = data[takes:]
         if kind == "vel":
             speed_data, accel_data = abs(data[0]), extras[0] if extras else self.settings["accel"]
@@ -214,11 +327,17 @@ class Axis:
         self._check("maxspeed", speed_data)
         speed, acceleration = self._speed(speed_data), self._acceleration(accel_data)
         position, velocity = self.track.nominal(t)
-        if kind == "vel" and not self._referenced:  # a rotary stage without reference turns for ever
+        if kind == "vel" and not self._referenced:
+            target = math.copysign(math.inf, data[0])
+        else:
+            target = self._zero + self._target(t, kind, data) / self._scale
+        low, high = self._model.ends
+        reachable = min(max(target, low), high)
+        if math.isinf(reachable):  # a rotary stage without reference turns for ever
             self._begin(t, motion.to_velocity(velocity, math.copysign(speed, data[0]), acceleration))
             return
-        target = self._zero + self._target(t, kind, data) / self._scale
-        self._begin(t, motion.to_target(position, velocity, target, speed, acceleration))
+        self._begin(t, motion.to_target(position, velocity, reachable, speed, acceleration))
+        self._ends_with = None if reachable == target else "FS"
 
     def _target(self, t: float, kind: str, data: Sequence[int]) -> int:
         low, high = self.settings["limit.min"], self.settings["limit.max"]
@@ -291,7 +410,8 @@ class Axis:
         """Scale all that counts in microsteps; the reference is lost."""
         old = self.settings["resolution"]
         for name in ("limit.min", "limit.max", "limit.home.pos", "limit.cycle.dist", "maxspeed", "accel"):
-            self.settings[name] = round(self.settings[name] * resolution / old)
+            if name in self.settings:
+                self.settings[name] = round(self.settings[name] * resolution / old)
         self._referenced = False
         self.flags |= set(self._model.unhomed_flags)
 
@@ -357,29 +477,33 @@ def parse(packet: bytes) -> Command | None:
 
 
 class ZaberChain:
-    """A chain of X-RSW stages on one port, addresses 1 to N.
+    """A chain of stages on one port, addresses 1 to N.
+
+    `on_stop`, where set, is told the place in the chain (from 1) of each stage that is told to `stop`.
 
     Parameters
     ----------
     clock : Clock
         Simulated time.
-    angles : sequence of float
-        The true angle each arm stands at when power comes, degrees from its index.
-    model : StageModel
+    positions : sequence of float
+        Where each stage stands when power comes, true degrees or mm from its index.
+    model : AxisModel
         All stages are alike.
     name : str
         Of the port.
     """
 
-    model = "zaber-x-rsw60a"
+    troubles = tuple(_TROUBLES)
 
-    def __init__(self, clock: Clock, angles: Sequence[float], model: StageModel | None = None, name: str = "stages") -> None:
-        if not 1 <= len(angles) <= 99:
-            raise SimError(f"a chain of {len(angles)} stages: expected 1 to 99")
+    def __init__(self, clock: Clock, positions: Sequence[float], model: AxisModel | None = None, name: str = "stages") -> None:
+        if not 1 <= len(positions) <= 99:
+            raise SimError(f"a chain of {len(positions)} stages: expected 1 to 99")
         self.name = name
         self.stage = model or StageModel()
+        self.model = self.stage.name
+        self.on_stop: Callable[[str], None] | None = None
         self._clock = clock
-        self._devices = [_Device(i + 1, Axis(self.stage, angle), 10_001 + i) for i, angle in enumerate(angles)]
+        self._devices = [_Device(i + 1, Axis(self.stage, position), 10_001 + i) for i, position in enumerate(positions)]
         self._lines: set[Line] = set()
         self._herald: asyncio.Task[None] | None = None
 
@@ -403,6 +527,19 @@ class ZaberChain:
             self._lines.discard(line)
             if not self._lines and self._herald is not None:
                 self._herald.cancel()
+
+    def trouble(self, kind: str, rng: np.random.Generator) -> str | None:
+        """Disable the driver of a drawn axis, or have one that moves halt; see `sim.troubles`."""
+        now, flag = self._clock.now(), _TROUBLES[kind]
+        devices = [device for device in self._devices if kind == "alarm" or device.axis.busy(now)]
+        if not devices:
+            return None
+        device = devices[int(rng.integers(len(devices)))]
+        device.axis.update(now)
+        if kind == "alarm":
+            device.axis.disable(now)
+            return f"device {device.address} shows {flag}"
+        return f"device {device.address} halts at {device.axis.halt(now, flag, rng)} microsteps and shows {flag}"
 
     def _next_arrival(self) -> float:
         return min(device.axis.arrival for device in self._devices)
@@ -467,6 +604,10 @@ class ZaberChain:
                 axis.home(now)
             case ("stop",):
                 axis.stop(now)
+                if self.on_stop is not None:
+                    self.on_stop(str(self.axes.index(axis) + 1))
+            case ("driver", "enable"):
+                axis.enable()
             case ("move", kind, *arguments):
                 axis.move(now, kind, arguments)
             case ("get", name):

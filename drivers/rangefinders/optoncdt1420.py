@@ -81,6 +81,7 @@ class StreamLink(Link):
 
     def __init__(self, port: Any, **settings: Any) -> None:
         super().__init__(port, **{**settings, "terminator": PROMPT})
+        self.unasked = (b"",)  # a stream goes on until it is stopped
         self._splitter = ValueSplitter()
 
     def _distribute(self, chunk: bytes) -> None:
@@ -344,7 +345,7 @@ def _answers(command: str, frame: bytes) -> bool | None:
 
 def _same_number(one: str, other: str) -> bool:
     try:
-        return math.isclose(float(one), float(other))
+        return "_" not in one and math.isclose(float(one), float(other))  # float() would pass over it
     except ValueError:
         return False
 

@@ -36,8 +36,9 @@ _RESET_INTEGRATION_S = 0.12  # 6 cycles at 50 Hz, what *RST leaves; a time allow
 _NO_ERROR = '0,"No error"'
 _OLD_ERRORS = 32  # more than the error queue holds
 
-_NUMBER = r"[+-]?\d+(?:\.\d*)?(?:E[+-]?\d+)?"
-_READING = re.compile(rf"({_NUMBER})([A-Za-z]+),({_NUMBER}),({_NUMBER})", re.ASCII)
+_NUMBER = r"[+-]\d\.\d{6}E[+-]\d\d"  # always that long: a byte lost or doubled shows
+_NO_VALUE = r"[+-]9\.91?E\+?37"  # as the manual writes them
+_READING = re.compile(rf"({_NUMBER}|{_NO_VALUE})([A-Za-z]+),({_NUMBER}),({_NUMBER})", re.ASCII)
 _ERROR = re.compile(r'([+-]?\d+)(?:,\s*"?([^"]*)"?)?', re.ASCII)
 
 
@@ -119,7 +120,7 @@ def parse_identity(line: bytes) -> Identity:
         Not four fields, or not a 6485 or 6487.
     """
     parts = [part.strip() for part in line.decode("ascii", "replace").split(",", 3)]
-    if len(parts) != 4 or parts[1] not in _MODELS:
+    if not line.isascii() or len(parts) != 4 or parts[1] not in _MODELS:
         raise UnexpectedReply("another instrument", raw=line, expected=" or ".join(_MODELS), hint="check which port the meter is on")
     vendor, model, serial_number, firmware = parts
     return Identity(vendor=vendor, model=model.removeprefix("MODEL "), serial_number=serial_number, firmware=firmware)
@@ -148,7 +149,7 @@ class Keithley6485:
         self._end = Endpoint(link, name)
         self._line_frequency_hz = line_frequency_hz
         self._bits = StatusBits() if status_bits is None else status_bits
-        self._doubt = Doubt()
+        self._doubt = Doubt(link)
         self._integration_s = _RESET_INTEGRATION_S
         self._range_a: float | None = None
 
@@ -332,6 +333,6 @@ class Keithley6485:
 
 def _parse_error(line: bytes) -> tuple[int, str]:
     match = _ERROR.fullmatch(line.decode("ascii", "replace").strip())
-    if match is None:
+    if match is None or not line.isascii():
         raise UnexpectedReply("not an entry of the error queue", raw=line, expected=_NO_ERROR)
     return int(match[1]), match[2] or ""

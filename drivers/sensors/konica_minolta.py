@@ -144,7 +144,7 @@ class LuminanceMeter:
         self._fast_s, self._slow_s, self._measuring_s = fast_s, slow_s, measuring_s
         self._chroma_over_is_good = chroma_over_is_good
         self._integration_s = slow_s
-        self._doubt = Doubt()
+        self._doubt = Doubt(link)
 
     @classmethod
     def open(
@@ -300,8 +300,8 @@ def _accept_setting(line: bytes) -> bool | None:
 
 
 def _split(line: bytes, expected: str) -> tuple[str, list[str]]:
-    match = _REPLY.fullmatch(line.decode("ascii", "replace").strip())
-    if match is None:
+    match = _REPLY.fullmatch(line.strip().decode("ascii", "replace"))
+    if match is None or not line.isascii():
         raise UnexpectedReply("not a reply of this meter", raw=line, expected=expected)
     return match[1] + match[2], [field.strip() for field in match[3].split(",")[1:]]
 

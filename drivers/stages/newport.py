@@ -2,7 +2,8 @@
 
 Source: ESP300/ESP301 user's manuals; error numbers partly from open drivers. Commands have no answer and answers carry neither name nor
 checksum. So every command is followed by ``TB?``, whose answer has a shape of its own; what ends at rest is read twice; and after a
-missing or malformed answer the controller is asked for its version, and all that comes before it is dropped.
+missing or malformed answer the controller is asked for its version, and all that comes before it is dropped. A target is read back once the
+axis is on its way.
 
 Not verified on hardware: the line speed of an ESP301 (a setting of the link: 921600 on its own port, 19200 on RS-232), several general
 error numbers, and which home search a stage needs (``home_search``). The controller does not tell whether an axis has been homed: the
@@ -15,12 +16,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from drivers.doubt import Doubt
 from drivers.endpoint import Endpoint, Veto
-from drivers.errors import InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
+from drivers.errors import InvalidSetting, NotHomed, UnexpectedReply
 from drivers.kinds import AxisState, Identity, MotionProfile
 from drivers.link import Link
 from drivers.motion import Stops, require_arrival
@@ -28,7 +29,7 @@ from drivers.motion import Stops, require_arrival
 T = TypeVar("T")
 
 STEADY_DEG = 0.01
-"""Two readings of a resting axis agree when they differ by no more; a servo at rest moves by far less."""
+"""Two readings of a resting axis, or two tellings of a target, agree when they differ by no more; a servo at rest moves by far less."""
 
 MOST_AXES = 3
 
@@ -42,8 +43,8 @@ _MOST_ERRORS = 32  # the controller keeps fewer
 _READINGS = 4
 
 _NUMBER = re.compile(rb"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:E[+-]?\d+)?)\s*", re.IGNORECASE)
-_ERROR = re.compile(rb"\s*(\d{1,3})\s*,\s*(\d+)\s*,\s*([ -~]+)")
-_VERSION = re.compile(rb"\s*(ESP\d{3}[!-~]*)\s+([ -~]+)", re.IGNORECASE)
+_ERROR = re.compile(rb"\s*(\d{1,3})\s*,\s*(\d+)\s*,\s*([!-~][ -~]*)")
+_VERSION = re.compile(rb"\s*(ESP\d{3}[!-~]*)\s+([!-~][ -~]*)", re.IGNORECASE)
 
 _ERROR_LINE = "an error message like '0, 451322, NO ERROR DETECTED'"
 
@@ -331,6 +332,11 @@ class NewportAxis:
         self._wire.drain(attempt)
         self._seen = len(self._wire.errors)
         self._wire.act(f"PA{deg / self._scale:+.6f}", attempt, veto=veto)
+        # Neither commands nor answers carry a checksum: a lost or doubled digit would be another angle, in either of them.
+        targets = (self._wire.number("DP?", attempt) * self._scale for _ in range(2))
+        if all(abs(target - deg) > STEADY_DEG for target in targets):
+            self.stop()
+            raise self._wire.fault("it was on its way elsewhere, and was stopped", attempt, hint="check the cable, then home the axis")
 
     def stop(self) -> None:
         """Tell the axis to decelerate to rest, now. Returns when the controller has answered, which is before it rests.
@@ -392,12 +398,12 @@ class NewportAxis:
         return tuple(str(error) for error in self._wire.errors[self._seen :] if error.axis in (0, self._wire.axis))
 
 
-@dataclass
 class _Controller:
     """What all axes on one link have in common."""
 
-    doubt: Doubt = field(default_factory=Doubt)
-    errors: list[EspError] = field(default_factory=list)  # all that were read, but those that answer a command
+    def __init__(self, link: Link) -> None:
+        self.doubt = Doubt(link)
+        self.errors: list[EspError] = []  # all that were read, but those that answer a command
 
 
 class _Wire(Endpoint):
@@ -476,11 +482,7 @@ class _Wire(Endpoint):
 
     def stop(self) -> None:
         """Send the stop, past whoever waits on the link; errors of earlier making that the answer brings are kept."""
-        try:
-            error = self._exchange(f"{self.axis}ST;TB?", _error_or_not_ours, "stopping", _ERROR_LINE, urgent=True)
-        except (TransportTimeout, UnexpectedReply):
-            self._doubt.arises()
-            error = self._exchange(f"{self.axis}ST;TB?", _error_or_not_ours, "stopping", _ERROR_LINE, urgent=True)
+        error = self._doubt.urgently(lambda: self._exchange(f"{self.axis}ST;TB?", _error_or_not_ours, "stopping", _ERROR_LINE, urgent=True))
         if error.code:
             self.errors.append(error)
 

@@ -20,12 +20,12 @@ import math
 import re
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from drivers.doubt import Doubt
 from drivers.endpoint import Endpoint, Veto
-from drivers.errors import InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
+from drivers.errors import InvalidSetting, NotHomed, UnexpectedReply
 from drivers.kinds import AxisState, Identity, MotionProfile
 from drivers.link import Link
 from drivers.motion import Stops, require_arrival
@@ -275,6 +275,7 @@ class SigmaKokiAxis:
                 moving=moving or self._waiting is not None,
                 homed=self._homed,
                 warnings=("limit sensor",) if self._axis in status.limits else (),
+                waiting=self._waiting is not None,
             )
 
     def limits(self) -> tuple[float, float]:
@@ -446,13 +447,13 @@ class _Motion:
     homes: bool = False
 
 
-@dataclass
 class _Controller:
     """What both axes on one link have in common."""
 
-    doubt: Doubt = field(default_factory=Doubt)
-    moving: int | None = None  # the axis started last, while the controller is busy
-    speeds: tuple[Speeds, Speeds] = (Speeds(), Speeds())
+    def __init__(self, link: Link) -> None:
+        self.doubt = Doubt(link)
+        self.moving: int | None = None  # the axis started last, while the controller is busy
+        self.speeds = (Speeds(), Speeds())
 
 
 class _Wire(Endpoint):
@@ -503,11 +504,7 @@ class _Wire(Endpoint):
     def stop(self) -> None:
         """Send the stop, past whoever waits on the link."""
         command, attempt = f"L:{self._axis}", "stopping"
-        try:
-            taken = self._command(command, attempt, urgent=True)
-        except (TransportTimeout, UnexpectedReply):
-            self._doubt.arises()
-            taken = self._command(command, attempt, urgent=True)
+        taken = self._doubt.urgently(lambda: self._command(command, attempt, urgent=True))
         if not taken and self._dialect.answers:
             raise self.fault(f"{command} was refused", attempt, expected="OK", hint="check the controller's command mode")
 

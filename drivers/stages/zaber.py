@@ -471,6 +471,7 @@ class _Wire(Endpoint):
 
     def __init__(self, link: Link, name: str, address: int, axis: int, checksums: bool) -> None:
         super().__init__(link, name)
+        link.unasked = (b"!", b"#")  # alerts and information
         self._address = address
         self._axis = axis
         self._checksums = checksums

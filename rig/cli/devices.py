@@ -81,12 +81,11 @@ def probe(settings: Settings, as_json: bool, trace: str | None) -> None:
 
     What does not answer is a line of the answer; the exit code is then 1.
     """
-    from rig.cli.instruments import mark, opened_config
+    from rig.cli.instruments import looking, mark, opened_config
     from rig.probing import probe_rows
-    from rig.session import paperwork
 
     config = opened_config(settings)
-    with paperwork(config, settings.workspace, trace=trace, moves=False) as papers:
+    with looking(settings, config, trace=trace) as papers:
         rows = probe_rows(config, papers)
     if as_json:
         click.echo(json.dumps({"simulated": config.simulated, "devices": rows}))

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import click
 
-from rig.bench import Bench, open_bench
+from rig.bench import Bench, Paperwork, open_bench
 from rig.cli.settings import Settings
 from rig.config import ANGLES, BenchConfig, load_config
 from rig.devices import Axis
@@ -40,8 +40,23 @@ def session(
                 with Interrupts(bench.stop, ask=False) as interrupts:
                     yield bench, interrupts
         finally:
-            if log.summary:
-                click.echo(f"trouble on the wires, dealt with: {log.summary}", err=True)
+            _tell(log)
+
+
+@contextmanager
+def looking(settings: Settings, config: BenchConfig, *, trace: str | None) -> Iterator[Paperwork]:
+    """Prepare a command that asks instruments one by one and moves nothing. What was done about trouble is said at the end."""
+    log = IncidentLog()
+    with paperwork(config, settings.workspace, trace=trace, report=log, moves=False) as papers:
+        try:
+            yield papers
+        finally:
+            _tell(log)
+
+
+def _tell(log: IncidentLog) -> None:
+    if log.summary:
+        click.echo(f"trouble on the wires, dealt with: {log.summary}", err=True)
 
 
 def with_its_arms(name: str) -> list[str]:

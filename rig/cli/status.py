@@ -18,13 +18,12 @@ def command(settings: Settings, axes: tuple[str, ...], as_json: bool, trace: str
 
     An axis that does not answer is a line of the answer; the exit code is then 1.
     """
-    from rig.cli.instruments import chosen, mark, opened_config
+    from rig.cli.instruments import chosen, looking, mark, opened_config
     from rig.probing import axis_rows
-    from rig.session import paperwork
 
     config = opened_config(settings)
     names = chosen(config, axes, list(config.axes), "axis")
-    with paperwork(config, settings.workspace, trace=trace, moves=False) as papers:
+    with looking(settings, config, trace=trace) as papers:
         rows = axis_rows(config, names, papers)
     if as_json:
         click.echo(json.dumps({"simulated": config.simulated, "axes": rows}))

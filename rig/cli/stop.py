@@ -20,14 +20,13 @@ def command(settings: Settings, as_json: bool, trace: str | None) -> None:
     A rig command that is using the bench is told to stop all axes and to end, its run closed as aborted; then each axis is told again from
     here. What cannot be reached is named; the exit code is then 1.
     """
-    from rig.cli.instruments import mark, opened_config
+    from rig.cli.instruments import looking, mark, opened_config
     from rig.ownership import end_owner
     from rig.probing import stop_rows
-    from rig.session import paperwork
 
     config = opened_config(settings)
     owner = end_owner(settings.workspace.lock, PATIENCE_S)
-    with paperwork(config, settings.workspace, trace=trace, moves=False) as papers:
+    with looking(settings, config, trace=trace) as papers:
         rows = stop_rows(config, papers)
     if as_json:
         click.echo(json.dumps({"ended": vars(owner) if owner else None, "axes": rows}))

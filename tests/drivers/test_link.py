@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import select
 import socket
 import threading
@@ -12,9 +13,11 @@ import pytest
 import serial
 
 from drivers.errors import BadChecksum, DeviceFault, InvalidSetting, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.incidents import Incident
 from drivers.link import Link
 
 SHORT_S = 0.1
+PATIENT_S = 0.5  # where one answer is missing and the next must come, on a computer that is busy
 
 
 def whole(line: bytes) -> bytes:
@@ -292,6 +295,143 @@ def test_traffic_is_every_byte_in_order(plug: Any, script: Any) -> None:
     story = b"".join((b">" if way == "tx" else b"") + data for _, way, data in log)
     assert story == b">A?\n1\r\n>B?\n2\r\n"
     assert [at for at, _, _ in log] == sorted(at for at, _, _ in log)
+
+
+# what is reported -----------------------------------------------------------------------------------------------------
+
+
+def told(incidents: list[Incident]) -> list[tuple[str, str]]:
+    """What was done and why."""
+    return [(incident.what, incident.detail) for incident in incidents]
+
+
+def hexed(data: bytes) -> str:
+    """Bytes as reports show them."""
+    return data.hex(" ")
+
+
+def test_nothing_is_reported_when_nothing_was_wrong(plug_both: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    link = plug_both(script.expect(b"A?\n"), script.send(b"4"), script.send(b"2\r\n"), script.serve(50, lambda line: line + b"\r\n"))
+    link._report = incidents.append
+    ask(link, b"A?\n", repeatable=True)
+    for number in range(50):
+        assert ask(link, b"%d\n" % number) == b"%d" % number
+    assert incidents == []
+
+
+def test_a_repeat_is_reported(plug: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    link = plug(script.expect(b"?"), script.expect(b"?"), script.send(b"7\r\n"), timeout_s=PATIENT_S, report=incidents.append)
+    ask(link, b"?", repeatable=True, device="theta_i")
+    (incident,) = incidents
+    assert (incident.port, incident.device, incident.attempt) == (link.url, "theta_i", "asking")
+    assert told(incidents) == [("repeated", "TransportTimeout: no reply")]
+    assert f"theta_i on {link.url}: asking: repeated (TransportTimeout: no reply)" == str(incident)
+    assert 1.7e9 < incident.time_s < 1e11
+
+
+def test_what_may_not_be_repeated_is_neither_repeated_nor_reported(plug: Any, script: Any) -> None:
+    """The error says it all."""
+    incidents: list[Incident] = []
+    link = plug(script.expect(b"move\n"), timeout_s=PATIENT_S, report=incidents.append)
+    with pytest.raises(TransportTimeout):
+        ask(link, b"move\n")
+    assert incidents == []
+
+
+def test_after_a_reply_cut_short_the_next_one_is_right(plug_both: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    cut = [script.expect(b"?"), script.send(b"10.0")]
+    link = plug_both(*cut, *script.dialogue(b"?", b"10.000\r\n", b"!", b"11.000\r\n"))
+    link._report = incidents.append
+    assert ask(link, b"?", repeatable=True, timeout_s=PATIENT_S) == b"10.000"
+    assert ask(link, b"!") == b"11.000"
+    assert told(incidents) == [
+        ("repeated", "TransportTimeout: the reply broke off before its terminator (0d 0a), got 31 30 2e 30"),
+        ("stale bytes dropped", hexed(b"10.0")),
+    ]
+
+
+def test_after_a_doubled_reply_the_next_one_is_right(plug_both: Any, script: Any) -> None:
+    """The copy comes with the reply or after it, but before the next question."""
+    incidents: list[Incident] = []
+    answered = threading.Event()
+    late = [script.wait(answered), script.send(b"two\r\n")]
+    link = plug_both(*script.dialogue(b"1?", b"one\r\none\r\n", b"2?", b"two\r\n"), *late, *script.dialogue(b"3?", b"three\r\n"))
+    link._report = incidents.append
+    assert ask(link, b"1?") == b"one"
+    assert ask(link, b"2?") == b"two"
+    answered.set()
+    assert select.select([link._fd], [], [], 5)[0]
+    assert ask(link, b"3?") == b"three"
+    assert sorted(told(incidents)) in (
+        [("foreign line passed over", hexed(b"one\r\n")), ("stale bytes dropped", hexed(b"two\r\n"))],
+        [("stale bytes dropped", hexed(line)) for line in (b"one\r\n", b"two\r\n")],
+    )
+
+
+def test_lines_nobody_claims_are_reported_though_the_reply_came(plug: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    link = plug(script.expect(b"?"), script.send(b"other\r\nmine\r\n"), report=incidents.append)
+    assert ask(link, b"?", only(b"mine")) == b"mine"
+    assert told(incidents) == [("foreign line passed over", hexed(b"other\r\n"))]
+
+
+def test_much_of_it_is_told_shortened(plug: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    link = plug(script.expect(b"?"), script.send(b"babble\r\n" * 100 + b"mine\r\n"), report=incidents.append)
+    assert ask(link, b"?", only(b"mine")) == b"mine"
+    (incident,) = incidents
+    assert incident.detail.startswith(hexed(b"babble\r\n"))
+    assert len(incident.detail) < 120
+
+
+def test_what_a_device_sends_on_its_own_is_no_incident(plug: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    link = plug(script.expect(b"?"), script.send(b"!alert\r\nother\r\nmine\r\n"), report=incidents.append)
+    link.unasked = (b"!", b"#")
+    assert ask(link, b"?", only(b"mine")) == b"mine"
+    assert told(incidents) == [("foreign line passed over", hexed(b"other\r\n"))]
+
+
+def test_the_answer_to_a_stop_that_overtook_is_no_incident(plug_both: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    blocked = threading.Event()
+    answers = (script.send(b"stopped\r\nmoved\r\n"),)
+    link = plug_both(script.expect(b"move\n"), script.tell(blocked), script.expect(b"STOP\n"), *answers)
+    link._report = incidents.append
+    with ThreadPoolExecutor(1) as pool:
+        moving = pool.submit(ask, link, b"move\n", only(b"moved"))
+        assert blocked.wait(5)
+        assert ask(link, b"STOP\n", only(b"stopped"), urgent=True) == b"stopped"
+        assert moving.result() == b"moved"
+    assert incidents == []
+
+
+def test_a_report_that_breaks_spoils_nothing(plug: Any, script: Any, caplog: pytest.LogCaptureFixture) -> None:
+    def broken(incident: Incident) -> None:
+        raise RuntimeError("disk full")
+
+    link = plug(script.expect(b"?"), script.expect(b"?"), script.send(b"7\r\n"), timeout_s=PATIENT_S, report=broken)
+    with caplog.at_level(logging.ERROR, "drivers.link"):
+        assert ask(link, b"?", repeatable=True) == b"7"
+    assert "repeated (TransportTimeout: no reply)" in caplog.text
+    assert "disk full" in caplog.text
+
+
+def test_a_report_may_use_the_link(plug: Any, script: Any) -> None:
+    """It is called while the link is free."""
+    answers: list[bytes] = []
+    lines = (b"other\r\nmine\r\n", b"why?", b"because\r\n")
+    link: Link
+
+    def report(incident: Incident) -> None:
+        answers.append(ask(link, b"why?", only(b"because")))
+
+    link = plug(*script.dialogue(b"?", *lines), report=report)
+    assert ask(link, b"?", only(b"mine")) == b"mine"
+    assert answers == [b"because"]
 
 
 def test_ports_without_a_file_descriptor_work_too() -> None:

@@ -23,6 +23,7 @@ from drivers.errors import (
     TransportTimeout,
     UnexpectedReply,
 )
+from drivers.incidents import Incident
 from drivers.link import Link
 from drivers.modbus import ModbusLink, ModbusRefusal, ModbusUnit, text
 from tests.drivers.rtu import framed, link_to
@@ -49,8 +50,9 @@ def unit(make_peer: Any) -> Any:
     """A device at address 1 whose other end follows the steps given."""
     with contextlib.ExitStack() as links:
 
-        def make(*steps: Any, timeout_s: float = 20.0, **options: Any) -> ModbusUnit:
-            link = links.enter_context(ModbusLink.open(make_peer(*steps).url, device="bench", timeout_s=timeout_s, baudrate=115200))
+        def make(*steps: Any, timeout_s: float = 20.0, report: Any = None, **options: Any) -> ModbusUnit:
+            opened = ModbusLink.open(make_peer(*steps).url, device="bench", timeout_s=timeout_s, report=report, baudrate=115200)
+            link = links.enter_context(opened)
             return ModbusUnit(link, "probe", **options)
 
         yield make
@@ -294,6 +296,59 @@ def test_every_byte_is_traced(make_peer: Any, script: Any) -> None:
         probe.holding(0x7F, 1, "reading")
     assert [data for way, data in traffic if way == "tx"] == [READ_STATUS] * 2
     assert b"".join(data for way, data in traffic if way == "rx") == REPLY + b"\x55\0" + REPLY
+
+
+# what is reported -----------------------------------------------------------------------------------------------------
+
+
+def told(incidents: list[Incident]) -> list[tuple[str, str]]:
+    """What was done and why; all by the same device."""
+    assert {(incident.device, incident.attempt) for incident in incidents} <= {("probe", "reading")}
+    return [(incident.what, incident.detail) for incident in incidents]
+
+
+def test_nothing_is_reported_when_nothing_was_wrong(unit: Plug, script: Any) -> None:
+    incidents: list[Incident] = []
+    echoing = [script.expect(READ_STATUS), script.send(READ_STATUS + REPLY)]  # an adapter that hears itself
+    probe = unit(*script.dialogue(*(READ_STATUS, REPLY) * 20), *echoing, report=incidents.append)
+    for _ in range(21):
+        probe.holding(0x7F, 1, "reading")
+    assert incidents == []
+
+
+def test_a_repeat_and_the_silence_before_it_are_reported(unit: Plug, script: Any) -> None:
+    incidents: list[Incident] = []
+    spoilt = REPLY[:-1] + b"\0"
+    probe = unit(*script.dialogue(READ_STATUS, spoilt, READ_STATUS, REPLY), timeout_s=SHORT_S * 4, report=incidents.append)
+    assert probe.holding(0x7F, 1, "reading") == (0x2030,)
+    why = f"BadChecksum: no reply with a right checksum, got {spoilt.hex(' ')}"
+    assert told(incidents) == [("repeated", why), ("resynchronised", f"by silence on the line after {why}")]
+
+
+def test_a_write_that_fails_is_not_reported_but_the_silence_after_it_is(unit: Plug, script: Any) -> None:
+    incidents: list[Incident] = []
+    probe = unit(script.expect(STOP), *script.dialogue(READ_STATUS, REPLY), timeout_s=SHORT_S, report=incidents.append)
+    with pytest.raises(TransportTimeout):
+        probe.write_one(0x7D, 0x20, "starting")
+    assert incidents == []
+    probe.holding(0x7F, 1, "reading")
+    assert told(incidents) == [("resynchronised", "by silence on the line after TransportTimeout: no reply")]
+
+
+def test_what_is_dropped_or_passed_over_is_reported(unit: Plug, script: Any) -> None:
+    """Noise before a reply, and its double behind it or before the next question."""
+    incidents: list[Incident] = []
+    answered, late = threading.Event(), threading.Event()
+    noisy = [script.expect(READ_STATUS), script.send(b"\x55" + REPLY + REPLY)]
+    doubled = [script.wait(answered), script.send(REPLY), script.tell(late)]
+    probe = unit(*noisy, *doubled, *script.dialogue(READ_STATUS, REPLY), report=incidents.append)
+    assert probe.holding(0x7F, 1, "reading") == (0x2030,)
+    answered.set()
+    assert late.wait(20)
+    assert probe.holding(0x7F, 1, "reading") == (0x2030,)
+    details = dict(told(incidents))
+    assert len(incidents) == 2
+    assert bytes.fromhex(details["foreign line passed over"] + details["stale bytes dropped"]) == b"\x55" + REPLY + REPLY
 
 
 # the decoder ----------------------------------------------------------------------------------------------------------

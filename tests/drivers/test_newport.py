@@ -93,6 +93,9 @@ def test_numbers_round_trip(number: float) -> None:
     assert parse_number(f"{number:+.6f}".encode()) == pytest.approx(number, abs=5e-7)
 
 
+TOLD = (b"1DP?\r", b"10.0\r\n")
+"""The target read back after a move to 10 deg."""
+
 # the axis -------------------------------------------------------------------------------------------------------------
 
 
@@ -262,18 +265,29 @@ def test_a_home_stopped_before_its_start_was_acknowledged_gives_no_reference(plu
 
 @pytest.mark.parametrize(("deg", "words"), [(10.0, b"+10.000000"), (-70.0, b"-70.000000"), (0.0, b"+0.000000"), (33.3, b"+33.300000")])
 def test_move(axis: Any, deg: float, words: bytes) -> None:
-    axis(*READY, b"1PA" + words + b";TB?\r", NONE).start_move(deg)
+    axis(*READY, b"1PA" + words + b";TB?\r", NONE, b"1DP?\r", words + b"\r\n").start_move(deg)
+
+
+def test_a_target_read_back_wrongly_once_does_not_matter(axis: Any) -> None:
+    told = (b"1DP?\r", b"1.0\r\n", b"1DP?\r", b"10.0\r\n")
+    axis(*READY, b"1PA+10.000000;TB?\r", NONE, *told).start_move(10.0)
+
+
+def test_an_axis_that_was_sent_elsewhere_is_stopped_at_once(axis: Any) -> None:
+    told = (b"1DP?\r", b"110.0\r\n") * 2
+    with pytest.raises(DeviceFault, match="on its way elsewhere"):
+        axis(*READY, b"1PA+10.000000;TB?\r", NONE, *told, b"1ST;TB?\r", NONE).start_move(10.0)
 
 
 def test_old_errors_do_not_refuse_a_new_move(axis: Any) -> None:
     old = (b"TB?\r", b"103, 5, FOLLOWING ERROR THRESHOLD EXCEEDED\r\n")
-    stage = axis(b"1MO?\r", b"1\r\n", *LIMITS, *old, *QUIET, b"1PA+10.000000;TB?\r", NONE, *rest(b"10.0"))
+    stage = axis(b"1MO?\r", b"1\r\n", *LIMITS, *old, *QUIET, b"1PA+10.000000;TB?\r", NONE, *TOLD, *rest(b"10.0"))
     stage.start_move(10.0)
     stage.check_arrival(10.0, 0.01)
 
 
 def test_an_error_of_another_axis_does_not_refuse_a_move(axis: Any) -> None:
-    axis(*READY, b"1PA+10.000000;TB?\r", b"203, 5, FOLLOWING ERROR\r\n", *QUIET).start_move(10.0)
+    axis(*READY, b"1PA+10.000000;TB?\r", b"203, 5, FOLLOWING ERROR\r\n", *QUIET, *TOLD).start_move(10.0)
 
 
 @pytest.mark.parametrize("code", [106, 113, 130, 9])

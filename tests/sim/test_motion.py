@@ -6,7 +6,7 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim.errors import SimError
@@ -18,6 +18,8 @@ speeds = st.floats(0.5, 120)
 accelerations = st.floats(5, 2000)
 STILL = Ringing(amplitude=0.0)
 
+untimed = settings(deadline=None)  # other work on the machine is none of these tests' business
+
 
 def knots(profile: Profile) -> list[float]:
     times = [profile.start]
@@ -26,6 +28,7 @@ def knots(profile: Profile) -> list[float]:
     return times
 
 
+@untimed
 @given(positions, velocities, positions, speeds, accelerations)
 def test_a_move_arrives_at_rest_and_keeps_its_limits(position: float, velocity: float, target: float, speed: float, accel: float) -> None:
     profile = Profile(10.0, position, velocity, to_target(position, velocity, target, speed, accel))
@@ -35,6 +38,7 @@ def test_a_move_arrives_at_rest_and_keeps_its_limits(position: float, velocity: 
     assert max(abs(profile.at(t)[1]) for t in times) <= max(speed, abs(velocity)) * (1 + 1e-9) + 1e-6
 
 
+@untimed
 @given(positions, velocities, positions, speeds, accelerations)
 def test_a_move_is_continuous(position: float, velocity: float, target: float, speed: float, accel: float) -> None:
     profile = Profile(0.0, position, velocity, to_target(position, velocity, target, speed, accel))
@@ -47,6 +51,7 @@ def test_a_move_is_continuous(position: float, velocity: float, target: float, s
         assert abs(v1 - v0) <= accel * (after - before) + 1e-6
 
 
+@untimed
 @given(positions, positions, speeds, accelerations)
 def test_duration_from_rest_has_the_closed_form(position: float, target: float, speed: float, accel: float) -> None:
     distance = abs(target - position)
@@ -67,6 +72,7 @@ def test_numbers_by_hand() -> None:
     assert back.duration == pytest.approx(0.1 + 2 * math.sqrt(4.0 / 600.0))
 
 
+@untimed
 @given(positions, velocities, accelerations)
 def test_stopping_takes_the_shortest_way(position: float, velocity: float, accel: float) -> None:
     profile = Profile(0.0, position, velocity, to_rest(velocity, accel))
@@ -74,6 +80,7 @@ def test_stopping_takes_the_shortest_way(position: float, velocity: float, accel
     assert profile.at(profile.end + 1)[0] == pytest.approx(position + velocity * abs(velocity) / (2 * accel))
 
 
+@untimed
 @given(velocities, velocities, accelerations)
 def test_a_velocity_is_reached_and_kept(velocity: float, wanted: float, accel: float) -> None:
     profile = Profile(0.0, 0.0, velocity, to_velocity(velocity, wanted, accel))
@@ -83,6 +90,7 @@ def test_a_velocity_is_reached_and_kept(velocity: float, wanted: float, accel: f
     assert math.isinf(profile.end) == (wanted != 0)
 
 
+@untimed
 @given(positions, positions, positions, st.floats(0, 20), speeds, accelerations)
 def test_retargeting_under_way_starts_from_where_the_axis_is(
     start: float, first: float, second: float, moment: float, speed: float, accel: float
@@ -161,3 +169,110 @@ def test_a_track_says_what_it_has_forgotten() -> None:
 def test_ringing_refuses_impossible_values(values: tuple[float, float, float]) -> None:
     with pytest.raises(SimError, match="ringing"):
         Ringing(*values)
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> tuple[Track, list[float], float]:
+    """A track with motions that are taken over, stopped softly or dead, or let end; when they began, and now; the highest acceleration."""
+    track, now, begun, highest = Track(draw(positions), STILL), 0.0, [0.0], 0.0
+    for kind in draw(st.lists(st.sampled_from(["move", "run", "brake", "dead"]), min_size=1, max_size=6)):
+        now += draw(st.floats(0, 4))
+        speed, acceleration, (position, velocity) = draw(speeds), draw(accelerations), track.nominal(now)
+        highest = max(highest, acceleration)
+        begun.append(now)
+        match kind:
+            case "move":
+                track.begin(now, to_target(position, velocity, draw(positions), speed, acceleration))
+            case "run":
+                track.begin(now, to_velocity(velocity, draw(velocities), acceleration))
+            case "brake":
+                track.begin(now, to_rest(velocity, acceleration))
+            case "dead":
+                track.begin(now, ())
+    return track, [*begun, now + draw(st.floats(0, 8))], highest
+
+
+@untimed
+@given(histories(), st.floats(0, 1))
+def test_reach_is_that_of_dense_sampling(history: tuple[Track, list[float], float], share: float) -> None:
+    track, (*begun, now), acceleration = history
+    for begin, reach in ((0.0, track.reach(now)), (share * now, track.reach(now, share * now))):
+        step = (now - begin) / 1000
+        times = [begin + step * i for i in range(1001)] + [t for t in begun if begin <= t <= now]
+        seen = [track.nominal(t)[0] for t in times]
+        # Nothing lies outside, and a turning point between two samples no further away than the acceleration takes it in half a step.
+        missed = acceleration * step**2 / 8 + 1e-6
+        assert reach[0] == pytest.approx(min(seen), abs=missed)
+        assert reach[1] == pytest.approx(max(seen), abs=missed)
+        assert reach[0] - 1e-9 <= min(seen)
+        assert reach[1] + 1e-9 >= max(seen)
+
+
+@untimed
+@given(positions, velocities, positions, speeds, accelerations)
+def test_reach_of_one_move_is_that_of_its_stops_and_turning_points(
+    position: float, velocity: float, target: float, speed: float, accel: float
+) -> None:
+    profile = Profile(5.0, position, velocity, to_target(position, velocity, target, speed, accel))
+    # A move that starts the wrong way, or too fast to stop in time, turns where it would have braked to a standstill.
+    turned = position + velocity * abs(velocity) / (2 * accel)
+    astray = velocity * (target - position) < 0 or abs(turned - position) > abs(target - position)
+    expected = [position, target, turned] if astray else [position, target]
+    assert profile.reach(5.0, profile.end) == (pytest.approx(min(expected), abs=1e-7), pytest.approx(max(expected), abs=1e-7))
+
+
+def test_reach_by_hand() -> None:
+    track = Track(10.0, STILL)
+    track.begin(1.0, to_target(10.0, 0.0, 100.0, 60.0, 600.0))  # 0.1 s and 3 deg to get up to speed
+    assert track.reach(1.0) == (10.0, 10.0)
+    assert track.reach(1.1) == (10.0, pytest.approx(13.0))  # not what it is going to do
+    track.begin(2.1, to_target(*track.nominal(2.1), 40.0, 60.0, 600.0))  # at 73 deg: brakes, 3 deg on, and back
+    assert track.reach(9.0) == (10.0, pytest.approx(76.0))
+    assert track.reach(9.0, 2.1) == (pytest.approx(40.0), pytest.approx(76.0))
+    assert track.reach(9.0, 8.0) == (pytest.approx(40.0), pytest.approx(40.0))
+    assert track.reach(1.6, 1.1) == (pytest.approx(13.0), pytest.approx(43.0))
+
+
+def test_reach_outlives_the_memory() -> None:
+    track = Track(0.0, STILL, memory=10.0)
+    for t, target in ((0.0, -200.0), (20.0, 50.0), (40.0, 0.0), (60.0, 1.0)):
+        track.begin(t, to_target(*track.nominal(t), target, 60.0, 600.0))
+    assert track.reach(70.0) == (pytest.approx(-200.0), pytest.approx(50.0))
+    with pytest.raises(SimError, match="remembers"):
+        track.reach(70.0, 5.0)
+
+
+def test_moving_is_moving_of_the_profile() -> None:
+    track = Track(0.0, Ringing())
+    track.begin(1.0, to_target(0.0, 0.0, 90.0, 60.0, 600.0))
+    assert [track.moving(t) for t in (0.5, 1.0, 2.0, track.end - 1e-6, track.end, track.end + 0.01)] == [
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
+    track.begin(2.0, ())
+    assert [track.moving(t) for t in (1.9, 2.0, 2.1)] == [True, False, False]
+
+
+def test_a_halt_planned_ahead_happens_unless_something_else_comes_first() -> None:
+    def halting() -> Track:
+        track = Track(0.0, STILL)
+        track.begin(0.0, to_target(0.0, 0.0, 90.0, 60.0, 600.0))
+        track.begin(1.1, ())  # at 63 deg
+        return track
+
+    track = halting()
+    assert track.nominal(0.6) == (pytest.approx(33.0), pytest.approx(60.0))
+    assert track.nominal(1.2) == (pytest.approx(63.0), 0.0)
+    assert (track.end, track.moving(1.0), track.moving(1.1)) == (1.1, True, False)
+    assert track.reach(0.6) == (0.0, pytest.approx(33.0))
+    assert track.reach(5.0) == (0.0, pytest.approx(63.0))
+    track = halting()
+    track.begin(0.6, to_rest(60.0, 600.0))  # 3 deg to brake
+    for since in (None, 0.1):
+        assert track.reach(5.0, since)[1] == pytest.approx(36.0)
+    assert track.nominal(5.0) == (pytest.approx(36.0), 0.0)
+    assert track.end == pytest.approx(0.7)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
 import random
 import select
 import threading
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import pytest
@@ -14,8 +16,10 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim.errors import SimError
 from sim.serve import Running
-from sim.wire import Splitter
+from sim.wire import Line, Splitter, beside
+from tests.sim.served import served
 
 Connect = Callable[[str], Any]
 
@@ -171,3 +175,59 @@ def test_noise_on_the_wire_is_survived(running: Running, connect: Connect, name:
             lines.append(port.readline())
             assert lines[-1], lines
     assert connect(running.url(name)).ask(question).startswith(answer)
+
+
+def test_an_async_context_runs_beside_and_is_left_in_its_own_thread() -> None:
+    seen: list[tuple[str, int]] = []
+
+    @contextlib.asynccontextmanager
+    async def context() -> AsyncIterator[asyncio.AbstractEventLoop]:
+        seen.append(("in", threading.get_ident()))
+        try:
+            yield asyncio.get_running_loop()
+        finally:
+            seen.append(("out", threading.get_ident()))
+
+    with beside(context()) as loop:
+        assert asyncio.run_coroutine_threadsafe(asyncio.sleep(0, "alive"), loop).result(10) == "alive"
+        assert [name for name, _ in seen] == ["in"]
+    assert [name for name, _ in seen] == ["in", "out"]
+    assert {thread for _, thread in seen}.isdisjoint({threading.get_ident()})
+    assert loop.is_closed()
+
+
+def test_what_keeps_a_context_from_being_entered_is_raised() -> None:
+    @contextlib.asynccontextmanager
+    async def context() -> AsyncIterator[None]:
+        raise SimError("no")
+        yield
+
+    with pytest.raises(SimError, match="no"), beside(context()):
+        pytest.fail("entered")
+
+
+class Asked:
+    """An instrument that notes whether its lines hang up, and serves a client until it says bye."""
+
+    name = model = "asked"
+
+    def __init__(self) -> None:
+        self.hang_up: list[bool] = []
+
+    async def serve(self, line: Line) -> None:
+        self.hang_up.append(line.hangs_up)
+        while data := await line.read():
+            line.write(data)
+            if data == b"bye\n":
+                return
+
+
+def test_a_socket_is_hung_up_on_and_a_line_says_whether_it_would_be(quiet: None, connect: Connect) -> None:
+    with served(Asked) as (instrument, ports):
+        client = connect(ports.tcp)
+        client.send(b"bye\n")
+        assert (client.line(), client.line()) == (b"bye\n", b"")
+        assert instrument.hang_up == [True]
+        with open_pty(ports.pty) as port:
+            assert ask(port, b"again") == b"again\n"
+        assert instrument.hang_up[1] is False

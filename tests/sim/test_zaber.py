@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sim.clock import ManualClock
 from sim.errors import SimError
 from sim.motion import Ringing
-from sim.zaber import Command, StageModel, ZaberChain, checksum, parse
+from sim.zaber import Command, LinearModel, StageModel, ZaberChain, checksum, parse
 from tests.sim.lines import Recorder
 
 TURN = 1_536_000
@@ -27,9 +27,9 @@ VECTORS = [
 class Desk:
     """A chain of two stages with a clock in hand."""
 
-    def __init__(self, model: StageModel | None = None) -> None:
+    def __init__(self, model: StageModel | LinearModel | None = None, positions: tuple[float, ...] = (200.0, 30.0)) -> None:
         self.clock = ManualClock()
-        self.chain = ZaberChain(self.clock, [200.0, 30.0], model)
+        self.chain = ZaberChain(self.clock, positions, model)
 
     def send(self, packet: str) -> list[str]:
         return [reply.decode("ascii").removesuffix("\r\n") for reply in self.chain.answer(packet.encode("latin-1"))]
@@ -458,3 +458,69 @@ def test_no_bytes_can_upset_it(packet: bytes, pause: float) -> None:
 def test_impossible_stages_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(SimError):
         ZaberChain(ManualClock(), [0.0], dataclasses.replace(StageModel(), **change))  # type: ignore[arg-type]
+
+
+# Linear stages
+
+MICROSTEP = 0.047625e-3  # mm
+
+
+@pytest.fixture
+def rail() -> Desk:
+    return Desk(LinearModel(ringing=Ringing(0.0)), (80.0, 30.0))
+
+
+def test_a_linear_stage_counts_microsteps_of_its_lead_screw(rail: Desk) -> None:
+    assert (rail.chain.model, Desk().chain.model) == ("zaber-x-lsm", "zaber-x-rsw60a")
+    assert rail.ask("/1 1 get limit.cycle.dist") == "@01 1 RJ IDLE WR BADCOMMAND"
+    rail.home()
+    assert (rail.data("/1 1 get limit.min"), rail.data("/1 1 get limit.max")) == ("0", "3149606")  # 150 mm
+    assert rail.data("/1 1 get maxspeed") == str(round(20 / MICROSTEP * 1.6384))
+    assert rail.data("/1 1 get accel") == str(round(200 / MICROSTEP * 1.6384e-4))
+    rail.ask("/1 1 move abs 1000000")
+    rail.wait()
+    assert rail.angle() == pytest.approx(47.625)
+    assert rail.angle(1) == pytest.approx(0.0)
+    assert rail.ask("/1 1 move abs 3149607").endswith("RJ IDLE -- BADDATA")
+    # 20 mm/s at 200 mm/s^2: 40 mm take 2.1 s.
+    rail.ask(f"/1 1 move rel {round(40 / MICROSTEP)}")
+    rail.wait(2.09)
+    assert " BUSY " in rail.ask("/1 1")
+    rail.wait(0.02)
+    assert rail.ask("/1 1") == "@01 1 OK IDLE -- 0"
+
+
+@pytest.mark.parametrize(("command", "end"), [("move vel 500000", 150.5), ("move vel -500000", -0.5), ("move rel 9000000", 150.5)])
+def test_a_carriage_without_reference_ends_where_the_rail_ends_and_says_it_stalled(rail: Desk, command: str, end: float) -> None:
+    assert rail.ask(f"/1 1 {command}") == "@01 1 OK BUSY WR 0"
+    rail.wait()
+    assert rail.ask("/1 1") == "@01 1 OK IDLE FS 0"
+    assert rail.angle() == pytest.approx(end)
+    rail.home()
+    assert rail.angle() == pytest.approx(0.0)
+
+
+def test_resolution_scales_a_linear_stage(rail: Desk) -> None:
+    rail.home()
+    rail.ask("/1 1 set resolution 128")
+    rail.home()
+    assert rail.data("/1 1 get limit.max") == "6299212"
+    rail.ask("/1 1 move abs 1000000")
+    rail.wait()
+    assert rail.angle() == pytest.approx(47.625 / 2)
+
+
+@pytest.mark.parametrize("change", [{"microstep": 0.0}, {"limit_max": -1.0}, {"speed": 0.0}])
+def test_an_impossible_linear_stage_is_refused(change: dict[str, float]) -> None:
+    with pytest.raises(SimError, match="above zero"):
+        ZaberChain(ManualClock(), [0.0], dataclasses.replace(LinearModel(), **change))  # type: ignore[arg-type]
+
+
+def test_stop_commands_are_told_axis_by_axis(homed: Desk) -> None:
+    told: list[str] = []
+    homed.chain.on_stop = told.append
+    homed.ask("/2 renumber 7")
+    homed.ask("/1 1 move abs 700000")
+    for packet in ("/7 1 stop", "/1 stop", "/stop", "/1 1 stop now", "/1 2 stop", "/1 1 stop:00", "/1 1 move vel 0"):
+        homed.send(packet)
+    assert told == ["2", "1", "1", "2"]

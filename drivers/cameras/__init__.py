@@ -1,0 +1,1 @@
+"""Cameras that drop RAW files into a folder."""

@@ -1,0 +1,138 @@
+"""`rig sim`."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rig.errors import ConfigError
+
+NAMES = {"source": "stages", "detector": "stages", "sensor": "meter"}
+"""Which simulated instrument each part of the bench in --toml is."""
+
+
+@click.group(epilog="\b\nExamples:\n  rig sim serve\n  rig sim serve newport apogee --json\n  rig sim replay wires.jsonl")
+def command() -> None:
+    """Serve simulated instruments to any software, over their own protocols."""
+
+
+@command.command(
+    "serve",
+    epilog="""\b
+Examples:
+  rig sim serve                             all instruments
+  rig sim serve stages meter --toml rig.toml   and in another window: rig home
+  rig sim serve shot --fault shot:cut-short:7  one damaged reply or request, decided by the seed 7
+  rig sim serve --names                     what there is""",
+)
+@click.argument("names", nargs=-1, metavar="[NAME]...")
+@click.option("--names", "list_names", is_flag=True, help="List the instruments and the faults there are, and serve nothing.")
+@click.option("--json", "as_json", is_flag=True, help="For programs: one line of JSON once all ports are open.")
+@click.option("--specimen", default="RR", show_default=True, metavar="NAME", help="What lies on the bench: a cultivar, or lambert:ALBEDO.")
+@click.option("--speed", default=1.0, show_default=True, metavar="X", help="Simulated seconds per second.")
+@click.option("--seed", default=1, show_default=True, type=click.IntRange(0), help="Decides positions at power-up, drift and noise.")
+@click.option("--source", metavar="NAME:AXIS", help="Which axis carries the lamp's arm [default: stages:1].")
+@click.option("--detector", metavar="NAME:AXIS", help="Which axis carries the detector's arm [default: stages:2].")
+@click.option(
+    "--fault", "faults", multiple=True, metavar="NAME:KIND:SEED[:AFTER]", help="A fault that strikes once, after so many messages."
+)
+@click.option("--toml", metavar="FILE", help="Write a rig.toml for this bench, of stages and meter; all made with it says SIMULATED.")
+@click.option("--no-pty", is_flag=True, help="TCP ports only.")
+def serve(
+    names: tuple[str, ...],
+    list_names: bool,
+    as_json: bool,
+    specimen: str,
+    speed: float,
+    seed: int,
+    source: str | None,
+    detector: str | None,
+    faults: tuple[str, ...],
+    toml: str | None,
+    no_pty: bool,
+) -> None:
+    """Start all simulated instruments, or those named, and say where each listens, until Ctrl-C or SIGTERM."""
+    from sim.errors import SimError
+    from sim.faults import KINDS
+    from sim.serve import INSTRUMENTS, Settings, build, serving
+    from sim.wire import beside
+
+    if list_names:
+        for name, description in INSTRUMENTS.items():
+            click.echo(f"{name:<10} {description}")
+        click.echo(f"faults: {', '.join(KINDS)}")
+        return
+    if toml is not None and Path(toml).exists():
+        raise ConfigError(f"--toml {toml}: is there already")
+    try:
+        world = build(
+            Settings(
+                specimen=specimen,
+                seed=seed,
+                speed=speed,
+                pty=not no_pty,
+                instruments=names or tuple(INSTRUMENTS),
+                source=source,
+                detector=detector,
+                faults=faults,
+            )
+        )
+        with beside(serving(world), "simulated instruments") as report:
+            if toml is not None:
+                Path(toml).write_text(_config(report, toml), encoding="utf-8")
+            _announce(report, as_json)
+    except SimError as exc:
+        raise ConfigError(str(exc)) from exc
+
+
+@command.command("replay", epilog="\b\nExample:\n  rig sim replay wires.jsonl --json")
+@click.argument("trace", metavar="FILE")
+@click.option("--json", "as_json", is_flag=True, help="For programs: one line of JSON once all ports are open.")
+def replay(trace: str, as_json: bool) -> None:
+    """Stand in for the instruments of a trace (`--trace FILE` wrote it): who asks what was asked hears what was answered.
+
+    At the end it says what was asked that is not in the trace.
+    """
+    from sim.errors import SimError
+    from sim.replay import in_background, load
+
+    try:
+        loaded = load(trace)
+    except SimError as exc:
+        raise ConfigError(str(exc)) from exc
+    with in_background(loaded) as replayed:
+        _announce(replayed.report, as_json)
+        for port, divergences in replayed.divergences.items():
+            for divergence in divergences:
+                click.echo(f"{port}: {divergence}", err=True)
+        click.echo("all that was recorded has been asked" if replayed.finished else "not all that was recorded has been asked", err=True)
+
+
+def _announce(report: dict[str, Any], as_json: bool) -> None:
+    """Say where the instruments are, and wait for a signal."""
+    from rig.interrupts import Interrupts
+
+    with Interrupts(lambda: None, ask=False) as interrupts:
+        if as_json:
+            click.echo(json.dumps(report))
+        else:
+            click.echo("SIMULATED instruments; Ctrl-C ends them")
+            for device in report["devices"]:
+                places = "  ".join(device[kind] for kind in ("tcp", "pty", "folder") if kind in device)
+                click.echo(f"{device['name']:<10} {device['model']:<22} {places}")
+        interrupts.pausing.wait()
+
+
+def _config(report: dict[str, Any], path: str) -> str:
+    """Return the simulated bench's configuration with the ports of instruments that are served already."""
+    import importlib.resources
+
+    text = importlib.resources.files("rig").joinpath("data/simulated.toml").read_text(encoding="utf-8")
+    places = {device["name"]: device.get("tcp") for device in report["devices"]}
+    for name in sorted(set(NAMES.values())):
+        if name not in places:
+            raise ConfigError(f"--toml {path}: wants {' and '.join(sorted(set(NAMES.values())))} to be served")
+        text = text.replace(f'"sim:{name}"', json.dumps(places[name]))
+    text = text.replace("# The simulated bench, used where there is no rig.toml.", "# Simulated instruments that are served already.")
+    return text.replace("speed = 10.0\n", f"speed = {report['speed']}\nserved = true\n", 1)
