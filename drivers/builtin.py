@@ -128,6 +128,8 @@ def _minolta(name: str, model: str, description: str) -> DeviceModel:
         "fast_s": Option(float, 0.1, "integration time of the fast response in s; not verified"),
         "slow_s": Option(float, 0.4, "integration time of the slow response in s; not verified"),
         "measuring_s": Option(float, 3.0, "time allowed for a measurement in s; not verified"),
+        "fixed_width": Option(bool, True, "insist on the width of a reading's fields, so that a lost digit shows; not verified"),
+        "agreement": Option(float, 0.05, "share by which two readings in turn may differ; 0 takes one on trust"),
     }
     if model == "CS-100A":
         options["chroma_over_is_good"] = Option(bool, False, "trust the luminance when the chromaticity is out of range; not verified")
@@ -237,6 +239,7 @@ BUILT_IN: tuple[DeviceModel, ...] = (
             "response_s": Option(float, 1.0, "what the sensor averages over in s; not verified"),
             "full_scale": Option(float, 4000.0, "over range from here on, umol/(m^2 s); not verified"),
             "busy_s": Option(float, 2.0, "how long it may be busy in s; not verified"),
+            "agreement": Option(float, 0.05, "share by which two readings in turn may differ; 0 takes one on trust"),
         },
     ),
     DeviceModel(

@@ -1,7 +1,8 @@
 """Apogee SQ-422X quantum sensor over Modbus RTU: photon flux, above all as a monitor of the lamp.
 
 Source: the project's protocol sheet, section 5.4 (SQ-422X manual, p13 and 14). Numbers are floats in two holding registers, high word
-first. Nothing is ever written to the sensor.
+first. Nothing is ever written to the sensor. Modbus answers do not say which register they are from, so readings are taken until two in
+turn agree (`drivers.agreement`).
 
 A quantum sensor takes light from a wide cone: for angle-resolved reflection it needs an aperture, and its floor may be too high for dark
 angles. Not verified: how long the sensor averages (`response_s`), the end of its range (`full_scale`), what it answers for registers it
@@ -15,6 +16,7 @@ import threading
 import time
 from typing import Protocol
 
+from drivers.agreement import agreed
 from drivers.errors import DeviceError, DeviceFault, InvalidSetting, UnexpectedReply
 from drivers.kinds import Identity, LightReading
 from drivers.link import Link
@@ -24,6 +26,9 @@ UNIT = "umol/(m^2 s)"
 
 OUTPUT, STATUS, FIRMWARE, ADDRESS = 0, 10, 12, 16
 """First register of a number; model and serial number follow the address."""
+
+FLOOR = 1.0
+"""umol/(m^2 s) by which two readings may differ in any case."""
 
 READY, BUSY = 0, 1
 POLL_S = 0.02
@@ -79,6 +84,8 @@ class SQ422X:
         A reading from here on is over range; not verified.
     busy_s : float, s
         How long it may be busy; not verified.
+    agreement : float
+        Share by which two readings in turn may differ; 0 takes one on trust.
     clock
         To wait with while it is busy.
     """
@@ -92,14 +99,18 @@ class SQ422X:
         response_s: float = 1.0,
         full_scale: float = 4000.0,
         busy_s: float = 2.0,
+        agreement: float = 0.05,
         clock: Clock = time,
     ) -> None:
+        if not 0 <= agreement < 1:
+            raise InvalidSetting(f"agreement {agreement}", device=name, expected="0, or a share below 1")
         for what, value in (("response_s", response_s), ("full_scale", full_scale), ("busy_s", busy_s)):
             if not 0 < value < math.inf:
                 raise InvalidSetting(f"{what} {value}", device=name, expected="a finite number above 0")
         self._link = link
         self._unit = ModbusUnit(link, name, address)
         self._response_s, self._full_scale, self._busy_s = response_s, full_scale, busy_s
+        self._agreement = agreement
         self._clock = clock
         self._lock = threading.RLock()
 
@@ -113,6 +124,7 @@ class SQ422X:
         response_s: float = 1.0,
         full_scale: float = 4000.0,
         busy_s: float = 2.0,
+        agreement: float = 0.05,
     ) -> SQ422X:
         """Make sure that a sensor is there which knows its address.
 
@@ -121,7 +133,7 @@ class SQ422X:
         UnexpectedReply
             Another device, or one that orders the words of a number otherwise.
         """
-        sensor = cls(link, name, address=address, response_s=response_s, full_scale=full_scale, busy_s=busy_s)
+        sensor = cls(link, name, address=address, response_s=response_s, full_scale=full_scale, busy_s=busy_s, agreement=agreement)
         sensor.identify()
         return sensor
 
@@ -186,14 +198,18 @@ class SQ422X:
         DeviceFault
             It stays busy, has a status that is not known, or tells no number.
         UnexpectedReply
-            A flux that the sensor cannot have read.
+            A flux that the sensor cannot have read, or readings that do not agree.
         """
         attempt = "reading the photon flux"
-        with self._lock:
+
+        def measure() -> LightReading:
             self._wait_until_ready(attempt)
             (value,) = self._unit.float32(self._unit.holding(OUTPUT, 2, attempt))
-        try:
             return judge(value, self._full_scale)
+
+        try:
+            with self._lock:
+                return agreed(measure, self._agreement, FLOOR)
         except DeviceError as error:
             error.complete(device=self.name, port=self._link.url, attempt=attempt)
             raise

@@ -4,11 +4,12 @@ Source: the project's protocol sheet, section 5.2, which knows the instruments t
 switched on with its F key held (remote mode), else it is silent.
 
 Replies carry neither ids nor checksums, but a reading has fields behind its code and the answer to a setting has none, so that one never
-passes for the other. After a missing or malformed reply a setting is repeated, and every reading before its answer is dropped.
+passes for the other. After a missing or malformed reply a setting is repeated, and every reading before its answer is dropped. A late
+reading looks like a new one, so readings are taken until two in turn agree (`drivers.agreement`).
 
 Not verified on an instrument: the meaning of the codes beyond their names, what stands behind the codes that report a range left (so it is
-not used), whether the luminance holds when the chromaticity is out of range (`chroma_over_is_good`), the two integration times (`fast_s`,
-`slow_s`) and how long a measurement may take (`measuring_s`).
+not used), how wide a reading's fields are (`fixed_width`), whether the luminance holds when the chromaticity is out of range
+(`chroma_over_is_good`), the two integration times (`fast_s`, `slow_s`) and how long a measurement may take (`measuring_s`).
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import re
 from collections.abc import Callable
 from typing import Literal, TypeVar
 
+from drivers.agreement import agreed
 from drivers.doubt import Doubt
 from drivers.endpoint import Endpoint
-from drivers.errors import DeviceFault, InvalidSetting, TransportTimeout, UnexpectedReply
+from drivers.errors import DeviceError, DeviceFault, InvalidSetting, TransportTimeout, UnexpectedReply
 from drivers.kinds import Identity, LightReading
 from drivers.link import Link
 
@@ -31,6 +33,12 @@ UNIT = "cd/m^2"
 
 FIELDS = {"LS-100": 1, "LS-110": 1, "CS-100A": 3}
 """Numbers in a reading: Y, or Y, x and y."""
+
+WIDTHS = {"LS-100": (8,), "LS-110": (8,), "CS-100A": (7, 5, 5)}
+"""Characters of each field, blanks included, as in the sheet's examples; not verified."""
+
+FLOOR = 0.05
+"""cd/m^2 by which two readings may differ in any case."""
 
 CALIBRATIONS = {"preset": "00", "varied": "01"}
 
@@ -53,8 +61,10 @@ _NUMBER = re.compile(r"\d*\.?\d+|\d+\.", re.ASCII)
 _REPLY = re.compile(r"(OK|ER)(\d\d)((?:,[^,]*)*)", re.ASCII)
 
 
-def parse_reading(line: bytes, model: Model, *, chroma_over_is_good: bool = False) -> LightReading:
+def parse_reading(line: bytes, model: Model, *, chroma_over_is_good: bool = False, fixed_width: bool = True) -> LightReading:
     """Take apart the answer to ``MES``, such as ``OK00,   123.4`` or, of a CS-100A, ``OK00,  123.4,.3100,.3300``.
+
+    With `fixed_width` the fields must have the `WIDTHS` of the model: nothing else would show that a digit was lost on the line.
 
     Returns
     -------
@@ -88,8 +98,13 @@ def parse_reading(line: bytes, model: Model, *, chroma_over_is_good: bool = Fals
     if len(fields) != FIELDS[model]:
         hint = f"is it another model than the {model}?"
         raise UnexpectedReply(f"a reading of {len(fields)} numbers", raw=line, expected=expected, hint=hint)
-    # Where the chromaticity is out of range its fields say nothing.
-    numbers = [_number(field) for field in (fields[:1] if chroma_over else fields)]
+    if chroma_over:
+        fields = fields[:1]  # the others say nothing
+    widths = WIDTHS[model][: len(fields)]
+    if fixed_width and tuple(map(len, fields)) != widths:
+        hint = "if the meter writes them so, give fixed_width = false"
+        raise UnexpectedReply("fields of another width", raw=line, expected=f"{expected}, of {widths} characters", hint=hint)
+    numbers = [_number(field) for field in fields]
     luminance = numbers[0]
     if luminance is None or None in numbers or any(number is None or number > 1 for number in numbers[1:]):
         raise UnexpectedReply("not a reading", raw=line, expected=expected)
@@ -119,6 +134,10 @@ class LuminanceMeter:
         Time allowed for a measurement beyond the link's own; not verified.
     chroma_over_is_good : bool
         Take the luminance of a CS-100A as good though the chromaticity is out of range; not verified, hence off.
+    fixed_width : bool
+        Insist on the `WIDTHS` of a reading's fields, which are not verified.
+    agreement : float
+        Share by which two readings in turn may differ; 0 takes one on trust.
     """
 
     def __init__(
@@ -132,9 +151,13 @@ class LuminanceMeter:
         slow_s: float = 0.4,
         measuring_s: float = 3.0,
         chroma_over_is_good: bool = False,
+        fixed_width: bool = True,
+        agreement: float = 0.05,
     ) -> None:
         if model not in FIELDS:
             raise InvalidSetting(f"model {model!r}", device=name, expected=", ".join(FIELDS))
+        if not 0 <= agreement < 1:
+            raise InvalidSetting(f"agreement {agreement}", device=name, expected="0, or a share below 1")
         if not 0 < fast_s < slow_s < math.inf or not 0 <= measuring_s < math.inf:
             given = f"fast_s {fast_s}, slow_s {slow_s}, measuring_s {measuring_s}"
             raise InvalidSetting(given, device=name, expected="finite times, slow_s longer than fast_s and that above 0")
@@ -143,6 +166,8 @@ class LuminanceMeter:
         self._model = model
         self._fast_s, self._slow_s, self._measuring_s = fast_s, slow_s, measuring_s
         self._chroma_over_is_good = chroma_over_is_good
+        self._fixed_width = fixed_width
+        self._agreement = agreement
         self._integration_s = slow_s
         self._doubt = Doubt(link)
 
@@ -160,6 +185,8 @@ class LuminanceMeter:
         slow_s: float = 0.4,
         measuring_s: float = 3.0,
         chroma_over_is_good: bool = False,
+        fixed_width: bool = True,
+        agreement: float = 0.05,
     ) -> LuminanceMeter:
         """Make sure that a meter is there, and set calibration, absolute readings, continuous measurement and the response.
 
@@ -179,6 +206,8 @@ class LuminanceMeter:
             slow_s=slow_s,
             measuring_s=measuring_s,
             chroma_over_is_good=chroma_over_is_good,
+            fixed_width=fixed_width,
+            agreement=agreement,
         )
         if calibration not in CALIBRATIONS:
             raise InvalidSetting(f"calibration {calibration!r}", device=name, expected=" or ".join(CALIBRATIONS))
@@ -232,12 +261,12 @@ class LuminanceMeter:
             self._integration_s = seconds
 
     def read(self) -> LightReading:
-        """Measure once (``MES``), in cd/m^2. A missing or garbled reading is taken once more.
+        """Measure (``MES``) until two readings agree, in cd/m^2. A missing or garbled reading is taken once more.
 
         Raises
         ------
         TransportTimeout, UnexpectedReply
-            No reading came, twice.
+            No reading came, twice; or they do not agree.
         DeviceFault
             The meter reports an error.
         """
@@ -246,11 +275,18 @@ class LuminanceMeter:
         def accept(line: bytes) -> LightReading | None:
             if line.strip() == b"OK00":  # a late answer to a setting
                 return None
-            return parse_reading(line, self._model, chroma_over_is_good=self._chroma_over_is_good)
+            return parse_reading(line, self._model, chroma_over_is_good=self._chroma_over_is_good, fixed_width=self._fixed_width)
 
-        return self._doubt.twice(
-            lambda: self._exchange("MES", accept, attempt, "OK00 and the reading"), lambda: self._resynchronise(attempt)
-        )
+        def measure() -> LightReading:
+            return self._doubt.twice(
+                lambda: self._exchange("MES", accept, attempt, "OK00 and the reading"), lambda: self._resynchronise(attempt)
+            )
+
+        try:
+            return agreed(measure, self._agreement, FLOOR)
+        except DeviceError as error:
+            error.complete(device=self._end.name, port=self._end.url, attempt=attempt)
+            raise
 
     def close(self) -> None:
         """Let go of the meter. The link stays open."""
@@ -303,11 +339,12 @@ def _split(line: bytes, expected: str) -> tuple[str, list[str]]:
     match = _REPLY.fullmatch(line.strip().decode("ascii", "replace"))
     if match is None or not line.isascii():
         raise UnexpectedReply("not a reply of this meter", raw=line, expected=expected)
-    return match[1] + match[2], [field.strip() for field in match[3].split(",")[1:]]
+    return match[1] + match[2], match[3].split(",")[1:]
 
 
 def _number(text: str) -> float | None:
-    return float(text) if _NUMBER.fullmatch(text) else None
+    digits = text.strip(" ")
+    return float(digits) if _NUMBER.fullmatch(digits) else None
 
 
 def _refusal(code: str, line: bytes) -> DeviceFault:

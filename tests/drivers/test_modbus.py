@@ -359,30 +359,6 @@ def distance(answer: bytes) -> list[int]:
     return list(link_to(lambda _: answer).ask(request, attempt="reading the distance").registers)
 
 
-@given(st.binary(max_size=300))
-def test_random_bytes_give_only_named_errors(answer: bytes) -> None:
-    with contextlib.suppress(TransportTimeout, BadChecksum, UnexpectedReply, ModbusRefusal):
-        assert len(distance(answer)) == 2
-
-
-@given(st.integers(0, 255), st.binary(max_size=60))
-def test_random_frames_with_right_checksums_give_only_named_errors(function: int, data: bytes) -> None:
-    try:
-        registers = distance(framed(bytes([1, function, *data]).hex()))
-    except (TransportTimeout, BadChecksum, UnexpectedReply, ModbusRefusal):
-        assert (function, data[:1], len(data)) != (4, b"\x04", 5)
-    else:
-        assert (function, len(data), len(registers)) == (4, 5, 2)
-
-
-@given(st.data())
-def test_any_one_damaged_byte_is_noticed(source: st.DataObject) -> None:
-    at = source.draw(st.integers(0, len(DISTANCE) - 1))
-    byte = source.draw(st.integers(0, 255).filter(lambda value: value != DISTANCE[at]))
-    with pytest.raises((TransportTimeout, BadChecksum, UnexpectedReply)):
-        distance(DISTANCE[:at] + bytes([byte]) + DISTANCE[at + 1 :])
-
-
 @given(st.integers(0, len(DISTANCE) - 1))
 def test_any_truncation_is_noticed(length: int) -> None:
     with pytest.raises(TransportTimeout):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 from collections.abc import Iterator
@@ -69,23 +68,6 @@ def test_versions() -> None:
 def test_noise_is_a_printable_version_or_none(line: bytes) -> None:
     found = find_version(line)
     assert found is None or all(part.isascii() and part.isprintable() for part in found)
-
-
-@given(st.binary(max_size=60))
-def test_random_bytes_give_only_named_errors(line: bytes) -> None:
-    with contextlib.suppress(UnexpectedReply):
-        assert math.isfinite(parse_number(line))
-    with contextlib.suppress(UnexpectedReply):
-        assert 0 <= parse_error(line).code <= 999
-
-
-@given(st.data())
-def test_damaged_messages_are_refused_or_still_one(source: st.DataObject) -> None:
-    line = bytearray(b"103, 451322, FOLLOWING ERROR THRESHOLD EXCEEDED")
-    at = source.draw(st.integers(0, len(line) - 1))
-    line[at] = source.draw(st.integers(0, 255))
-    with contextlib.suppress(UnexpectedReply):
-        assert parse_error(bytes(line)).text
 
 
 @given(st.floats(-1e6, 1e6))

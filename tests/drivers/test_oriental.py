@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from drivers.errors import (
     BadChecksum,
@@ -34,7 +32,7 @@ from sim.clock import SimClock
 from sim.modbus import ModbusBus
 from sim.oriental import STOP as STOP_BIT
 from sim.oriental import AzAxis, AzModel
-from tests.drivers.rtu import framed, link_to
+from tests.drivers.rtu import framed
 from tests.sim.served import served
 
 SPEED = 40.0
@@ -337,13 +335,3 @@ def test_a_stop_input_held_by_another_master(bench: Rig) -> None:
     bench.simulated.write_holding(bench.now(), 0x7D, (STOP_BIT,))
     with pytest.raises(DeviceFault, match="not ready"):
         bench.axis.start_move(10.0)
-
-
-@given(st.binary(min_size=8, max_size=8), st.binary(min_size=4, max_size=4))
-def test_random_registers_give_only_named_errors(told: bytes, position: bytes) -> None:
-    def answer(request: bytes) -> bytes:
-        return framed("01 03 08" + told.hex()) if request == ASK_OUTPUTS else framed("01 03 04" + position.hex())
-
-    with contextlib.suppress(UnexpectedReply):
-        state = OrientalAxis(link_to(answer), "theta_i").state()
-        assert state.position == int.from_bytes(position, "big", signed=True) / 50

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 from collections.abc import Iterator
@@ -47,12 +46,6 @@ def says(*lines: bytes) -> tuple[bytes, ...]:
 )
 def test_status_lines(line: bytes, status: Status) -> None:
     assert parse_status(line) == status
-
-
-@given(st.binary(max_size=40))
-def test_random_bytes_give_only_named_errors(line: bytes) -> None:
-    with contextlib.suppress(UnexpectedReply):
-        parse_status(line)
 
 
 @given(st.binary(max_size=30) | st.binary(max_size=30).map(lambda noise: b"V" + noise))

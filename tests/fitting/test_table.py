@@ -69,8 +69,9 @@ def by_points(theta_i: float, theta_r: float, phi: float, aspect: float, n: floa
 
     def sees(d: NDArray[np.float64]) -> NDArray[np.bool_]:
         left = np.flatnonzero(normal @ d > 0)
+        reach = k * math.hypot(d[0], d[1]) / d[2] + 2  # as far as light runs level below the domes' tops, from rim to rim
         for x, y in sorted(
-            ((2.0 * i + j, math.sqrt(3) * j) for i in range(-14, 15) for j in range(-14, 15) if (i, j) != (0, 0)),
+            (place for i in range(-14, 15) for j in range(-14, 15) if 0 < math.hypot(*(place := (2.0 * i + j, math.sqrt(3) * j))) < reach),
             key=lambda c: math.hypot(*c),
         ):
             turn = azimuth[left]

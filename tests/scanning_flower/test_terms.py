@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 from scipy.sparse import csr_matrix
@@ -14,6 +14,7 @@ from scanning.terms import Habit, Terms, apart_and_nestled, inner_nearer, measur
 
 K = 3
 seeds = st.integers(0, 2**32 - 1)
+few = settings(max_examples=25)  # each holds hundreds of derivatives at a random place
 
 
 def somewhere(rng: np.random.Generator) -> Array:
@@ -32,6 +33,7 @@ def slope(residual: object, q: Array) -> Array:
     return np.array(columns).T
 
 
+@few
 @given(seeds)
 def test_the_measurements_rows_are_their_derivatives(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -42,6 +44,7 @@ def test_the_measurements_rows_are_their_derivatives(seed: int) -> None:
     np.testing.assert_allclose(m.terms(q).rows.toarray(), slope(lambda at: m.terms(at).residual, q), rtol=1e-4, atol=1e-4)
 
 
+@few
 @given(seeds)
 def test_bases_on_a_cone_are_on_the_receptacle_and_the_rows_say_how_they_leave_it(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -72,6 +75,7 @@ def test_inner_bases_count_only_where_they_are_farther_out() -> None:
     assert inner_nearer(q, [], 0.3).cost == 0
 
 
+@few
 @given(seeds)
 def test_the_gaps_rows_are_their_derivatives(seed: int) -> None:
     rng = np.random.default_rng(seed)
