@@ -13,8 +13,8 @@ READINGS = 4
 def agreed(measure: Callable[[], LightReading], share: float, floor: float) -> LightReading:
     """Measure until two readings in turn agree, and return the second; with no `share` take the first on trust.
 
-    A reading that is not good, out of range say, is returned at once: it will not be used. An answer that is lost, doubled or late shifts or
-    repeats what follows; of two readings in turn at most one is then wrong.
+    A reading that is not good, out of range say, is returned at once: it will not be used. An answer that is lost, doubled or late shifts
+    or repeats what follows; of two readings in turn at most one is then wrong.
 
     Parameters
     ----------

@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from drivers.kinds import AxisState
+from drivers.kinds import AxisState, ForgetfulStage, Stage
 from rig.errors import RunError
 from rig.files import write_atomically
+from rig.kinematics import AxisMap
 
 SCHEMA_VERSION = 1
 
@@ -118,3 +119,27 @@ class AxisMemory:
     def put(self, *, setpoint: float | None, readback: float, under_way: bool, homed: bool) -> None:
         """Write it down; see `AxisRecords.put`."""
         self.records.put(self.identity, setpoint=setpoint, readback=readback, under_way=under_way, homed=homed)
+
+
+def recollected(name: str, stage: Stage, axis_map: AxisMap, tolerance: float, record: AxisRecord | None) -> tuple[str, ...]:
+    """Compare a stage with what was written down of it last, and return what somebody should know before it moves.
+
+    A stage that does not tell whether it was homed is taken as homed where the record says so, the last motion was seen to its end, and it
+    stands where it was left.
+    """
+    if record is None:
+        return ()
+    state = stage.state()
+
+    def theta(position: float) -> str:
+        return f"{axis_map.to_theta(position):.3f} {stage.unit}"
+
+    if record.under_way:
+        aim = "homing" if record.setpoint is None else f"on its way to {theta(record.setpoint)}"
+        return (f"{name} was {aim} when the last program that moved it ended without seeing the end; it is at {theta(state.position)} now",)
+    if abs(state.position - record.readback) > tolerance:
+        left, here = theta(record.readback), theta(state.position)
+        return (f"{name} was left at {left} and is at {here}: switched off, or moved by somebody else; home it",)
+    if isinstance(stage, ForgetfulStage) and not state.homed and record.vouches(state, tolerance):
+        stage.trust_reference()
+    return ()

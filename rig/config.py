@@ -300,11 +300,16 @@ def _check_neighbours(where: str, first: str, device: AxisConfig | SensorConfig,
 
     models = catalogue.load()
     one, two = (models.lookup(each.model) for each in (other, device))
-    if one.open_port is not two.open_port or {**one.line, **other.serial} != {**two.line, **device.serial}:
+    if one.open_port != two.open_port or {**one.line, **other.serial} != {**two.line, **device.serial}:
         raise ConfigError(f"{where}.port: {device.port!r} is the port of {first}, whose line settings or protocol are others")
-    if type(device) is type(other) and device.model == other.model and device.options == other.options:
-        key = "axis" if "axis" in two.options and "address" not in device.options else "address"
+    if _place(one, other) == _place(two, device):
+        key = "address" if "address" in two.options else "axis"
         raise ConfigError(f"{where}.{key}: the same instrument as {first}; give each its own address, axis or port")
+
+
+def _place(model: "DeviceModel", device: AxisConfig | SensorConfig) -> dict[str, Any]:
+    """Return what tells a device from the others on its port."""
+    return {key: device.options.get(key, model.options[key].default) for key in ("address", "axis") if key in model.options}
 
 
 class _Table:

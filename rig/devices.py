@@ -13,8 +13,8 @@ from typing import Any, Generic, TypeVar
 
 from drivers.errors import BadChecksum, DeviceError, DeviceFault, MoveTimeout, NotHomed, TransportTimeout, UnexpectedReply
 from drivers.incidents import Incident, Report, What
-from drivers.kinds import AxisState, DistanceReading, ForgetfulStage, LightReading, LightSensor, RangeFinder, Stage
-from rig.axisrecord import AxisMemory, AxisRecord
+from drivers.kinds import AxisState, DistanceReading, LightReading, LightSensor, RangeFinder, Stage
+from rig.axisrecord import AxisMemory, AxisRecord, recollected
 from rig.bus import BusWorker, Task
 from rig.clock import Clock
 from rig.errors import InterlockError
@@ -26,6 +26,9 @@ POLL_S = 0.004
 
 WATCH_S = 0.05
 """How often an axis on its way is looked at, s of the bench's time."""
+
+LOOKS = 2
+"""How often an arm that has settled is looked at before it counts as elsewhere."""
 
 ASTRAY = 0.5
 """How far beside its way an axis may be seen, in its unit, before it is stopped."""
@@ -138,7 +141,7 @@ class Axis(Configured):
         self._setpoint = math.nan
         self._readback = math.nan
         self._homed = False
-        self.notices = self._recollect()
+        self.notices = recollected(name, driver, axis_map, tolerance, self.last_command)
         self.refresh()
 
     # -- what it knows -------------------------------------------------------------------------------------------------
@@ -174,31 +177,6 @@ class Axis(Configured):
         self._homed = state.homed
         self._readback = self.map.to_theta(state.position)
         return state
-
-    def _recollect(self) -> tuple[str, ...]:
-        """Compare the stage with what was written down of it last."""
-        record = self.last_command
-        if record is None:
-            return ()
-        state = self.driver.state()
-        here, unit = self._theta_text(state.position), self.unit
-        if record.under_way:
-            aim = "homing" if record.setpoint is None else f"on its way to {self._theta_text(record.setpoint)} {unit}"
-            return (f"{self.name} was {aim} when the last program that moved it ended without seeing the end; it is at {here} {unit} now",)
-        left = self._theta_text(record.readback)
-        if abs(state.position - record.readback) > self.tolerance:
-            return (f"{self.name} was left at {left} {unit} and is at {here} {unit}: switched off, or moved by somebody else; home it",)
-        if isinstance(self.driver, ForgetfulStage) and not state.homed and record.vouches(state, self.tolerance):
-            self.driver.trust_reference()
-        return ()
-
-    def _theta_text(self, position: float) -> str:
-        return f"{self.map.to_theta(position):.3f}"
-
-    def travel_s(self, from_deg: float, to_deg: float) -> float:
-        """Return the bench seconds a move takes, settling included."""
-        distance = abs(to_deg - from_deg)
-        return self._profile.duration_s(distance) + self.settle_s if distance else 0.0
 
     # -- bluesky -------------------------------------------------------------------------------------------------------
 
@@ -287,10 +265,12 @@ class Axis(Configured):
         if not self._started(lambda: self.driver.start_move(goal), goal, state, stopped):
             return
         yield from self._until_idle(f"the move to {target:g} {self.unit}", duration, stopped, way=(self._readback, target))
-        if not stopped.is_set():
-            self.driver.check_arrival(goal, self.tolerance)
-            yield self.settle_s
-        self._remember(goal, self.refresh(), under_way=False)
+        if stopped.is_set():
+            self._remember(goal, self.refresh(), under_way=False)
+            return
+        self.driver.check_arrival(goal, self.tolerance)
+        yield self.settle_s
+        self._remember(goal, self._settled(goal), under_way=False)
 
     def _home(self, stopped: threading.Event) -> Task:
         state = self.refresh()
@@ -303,6 +283,20 @@ class Axis(Configured):
         self._remember(None, self.refresh(), under_way=False)
         if not stopped.is_set() and not self._homed:
             raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
+
+    def _settled(self, goal: float) -> AxisState:
+        """Look where the arm stands for the record: what looks different from what was made sure of may be a late answer, once."""
+        for _ in range(LOOKS):
+            state = self.refresh()
+            if not state.moving and abs(state.position - goal) <= self.tolerance:
+                return state
+        raise DeviceFault(
+            f"seen at {self._readback:.3f} {self.unit} after it had arrived",
+            device=self.name,
+            attempt="settling",
+            expected=f"rest at {self.map.to_theta(goal):.3f} {self.unit}",
+            hint="was it moved by hand?",
+        )
 
     def _remember(self, goal: float | None, state: AxisState, *, under_way: bool) -> None:
         if self._memory is not None:

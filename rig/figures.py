@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 SIMULATED = "SIMULATED"
 """What everything made from simulated readings or petals says."""
 
+FORMATS = ("png", "svg")
+"""What plots are drawn as."""
+
 DARK, PALE = ("BR", "RR"), ("PR", "WR")
 SCALES = {DARK: 40.0, PALE: 400.0}
 """Radial scales of the paper's figures 1 and 8, and 2 and 9."""
@@ -69,7 +72,7 @@ def draw_all(fits: Mapping[str, "StoredFit"], folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name, (draw, size) in drawers.items():
-        paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
+        paths = [folder / f"{name}.{ending}" for ending in FORMATS]
         # Figure 6 is the model alone: nothing in it was measured.
         with saved_figure(size, paths, [SIMULATED] if simulated and name != "figure-6" else []) as figure:
             draw(figure)

@@ -20,7 +20,7 @@ DETAIL = 0.28
 
 
 def draw_flower(
-    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, marks: Sequence[str], workspace: "Workspace"
+    flower: Path, fits: "Mapping[str, StoredFit]", folder: Path, *, marks: Sequence[str], workspace: "Workspace", side: int = SIDE
 ) -> tuple[list[Path], str]:
     """Draw figures 11, 13 and 14 as PNG into `folder`; return the files and the table of contrasts.
 
@@ -35,6 +35,8 @@ def draw_flower(
         What every figure must say of itself; see `rig.pictures.marks_of`.
     workspace : Workspace
         Keeps the reflection models.
+    side : int
+        Of the ray-cast pictures, pixels.
     """
     from render.camera import Box
     from render.images import boxed
@@ -44,7 +46,7 @@ def draw_flower(
     folder.mkdir(parents=True, exist_ok=True)
     scene = read_flower(flower)
     raycaster, shade = Raycaster(scene), shade_of(fits["RR"], workspace)
-    camera = frame(raycaster, SIDE, SIDE)
+    camera = frame(raycaster, side, side)
     written = [folder / f"figure-{number}.png" for number in (11, 13, 14)]
 
     with saved_figure((9, 4.4), [written[0]], marks) as figure:
@@ -53,11 +55,11 @@ def draw_flower(
 
     picture = take(raycaster, camera, shade)
     whole = show(picture, "RR")
-    side = round(SIDE * DETAIL)
-    box = Box(*_brightest(picture.radiance, side), side, side)
-    detail = show(take(raycaster, camera.detail(box, enlarge=SIDE / side), shade), "RR")
+    part = round(side * DETAIL)
+    box = Box(*_brightest(picture.radiance, part), part, part)
+    detail = show(take(raycaster, camera.detail(box, enlarge=side / part), shade), "RR")
     with saved_figure((9, 4.8), [written[1]], marks) as figure:
-        _images(figure, {"RR": boxed(whole, box), f"detail, {SIDE / side:.1f} times": detail})
+        _images(figure, {"RR": boxed(whole, box), f"detail, {side / part:.1f} times": detail})
 
     pictures, rows, matt = compare(raycaster, camera, fits, workspace)
     images = {f"{r.label}: C {r.C:.2f}, I(+40)/I(-40) {r.measured:.2f}": show(pictures[r.label], r.label) for r in rows}

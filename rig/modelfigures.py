@@ -12,7 +12,7 @@ from fitting.ablation import READ, Step, ablation
 from fitting.model import Model, cell_of
 from fitting.reflectance import INTENSITY
 from rig.cellfigure import draw_cell
-from rig.figures import SPEC_ENLARGED, TERM_STYLES, TERMS, polar_axes, round_up, saved_figure, towards_light
+from rig.figures import FORMATS, SPEC_ENLARGED, TERM_STYLES, TERMS, polar_axes, round_up, saved_figure, towards_light
 from rig.models import PETAL
 
 if TYPE_CHECKING:
@@ -119,8 +119,9 @@ def draw_model(
     width: float,
     others: Mapping[str, Model],
     ablations: Sequence[Ablation],
+    formats: Sequence[str] = FORMATS,
 ) -> list[Path]:
-    """Draw all pages as PNG and SVG into `folder`, made where it is not there; return the files.
+    """Draw all pages into `folder`, made where it is not there; return the files.
 
     Parameters
     ----------
@@ -135,6 +136,8 @@ def draw_model(
         Of the same geometry, the other modes, to draw side by side; may be empty.
     ablations : sequence of Ablation
         See `ablations`.
+    formats : sequence of str
+        Some of `rig.figures.FORMATS`.
     """
     mixed = model.reflectance(**numbers)
     below = model.transmittance(direct=True, **numbers) if model.body is not None else None
@@ -157,7 +160,7 @@ def draw_model(
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for name, (draw, size) in pages.items():
-        paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
+        paths = [folder / f"{name}.{ending}" for ending in formats]
         with saved_figure(size, paths, []) as figure:
             draw(figure)
         written += paths

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from drivers.errors import DeviceError
-from drivers.kinds import ForgetfulStage, LightSensor, RangeFinder, Stage
-from rig.axisrecord import AxisRecord
+from drivers.kinds import LightSensor, RangeFinder, Stage
+from rig.axisrecord import AxisRecord, recollected
 from rig.bench import Paperwork
 from rig.config import AxisConfig, BenchConfig, SensorConfig
 from rig.errors import ConfigError
@@ -58,19 +58,20 @@ def axis_rows(config: BenchConfig, names: Sequence[str], papers: Paperwork) -> l
         record = papers.records.get(axis.identity) if papers.records else None
         stage = _stage(ports, axis)
         try:
+            notices = recollected(name, stage, axis.map, axis.tolerance, record)
             state = stage.state()
         finally:
             stage.close()
-        remembered = record is not None and isinstance(stage, ForgetfulStage) and record.vouches(state, axis.tolerance)
         return {
             "position": axis.map.to_theta(state.position),
             "unit": axis.unit,
             "moving": state.moving,
-            "homed": state.homed or remembered,
+            "homed": state.homed,
             "warnings": list(state.warnings),
             "low": axis.limits[0],
             "high": axis.limits[1],
             "last_command": _last_command(axis, record) if record else None,
+            "notices": list(notices),
         }
 
     return _rows(config, names, papers, ask)

@@ -22,14 +22,23 @@ from rig.units import duration
 from rig.workspace import Workspace
 
 PETALS, OPENING, SEED = 25, 0.45, 3
-SIDE = 800
-"""The virtual rose, and its picture in pixels."""
+POINTS = 11_000
+"""The virtual rose, and of each petal's scan."""
+
+SIDE, SAMPLES = 800, 9
+"""Pixels of its picture along a side, and samples of each."""
+
+FIGURES = 0.8
+"""Side of the pictures in figures, as a part of that."""
 
 
-@click.command(epilog="\b\nExamples:\n  rig --workspace /tmp/try demo\n  rig demo --petals 12")
+@click.command(epilog="\b\nExamples:\n  rig --workspace /tmp/try demo\n  rig demo --petals 12 --size 400 --samples 4")
 @click.option("--petals", default=PETALS, show_default=True, type=click.IntRange(5, 45), help="Of the virtual rose.")
+@click.option("--points", default=POINTS, show_default=True, type=click.IntRange(2000, 20_000), help="Of each petal's scan, about.")
+@click.option("--size", default=SIDE, show_default=True, type=click.IntRange(100, 4000), help="Pixels of its picture along a side.")
+@click.option("--samples", default=SAMPLES, show_default=True, type=click.IntRange(1, 256), help="Of each pixel.")
 @click.pass_obj
-def command(settings: Settings, petals: int) -> int:
+def command(settings: Settings, petals: int, points: int, size: int, samples: int) -> int:
     """Measure four cultivars on the simulated bench, fit, scan a virtual rose, put it together, draw, and say where everything lies."""
     started = time.monotonic()
     config = load_config(settings.config)
@@ -51,23 +60,23 @@ def command(settings: Settings, petals: int) -> int:
     draw_all(fits, settings.workspace.figures)
     click.echo("\n" + closing_table(fits, runs))
     flower = settings.workspace.flowers / "demo"
-    free = build_rose(flower, petals)
-    picture = picture_rose(flower, fits, settings.workspace)
+    free = build_rose(flower, petals, points)
+    picture = picture_rose(flower, fits, settings.workspace, size, samples)
     click.echo(f"\nruns     {settings.workspace.runs}\nfits     {settings.workspace.fits}\nflower   {flower}")
     click.echo(f"figures  {settings.workspace.figures}\npicture  {picture}")
     click.echo(f"all done in {duration(time.monotonic() - started)}")
     return 0 if free else 1
 
 
-def build_rose(flower: Path, petals: int) -> bool:
+def build_rose(flower: Path, petals: int, points: int) -> bool:
     """Scan a virtual rose petal by petal and put it together from the scans; return whether no two petals intersect."""
-    from sim.rose import write_specimen
+    from sim.rose import RangeFinder, write_specimen
 
     # The folder is the demo's own: what an earlier one left would be mixed with the new petals.
     shutil.rmtree(flower, ignore_errors=True)
     scans = flower / "scans"
     click.echo(f"\na virtual rose of {petals} petals is measured, taken apart and scanned", err=True)
-    write_specimen(scans, petals, OPENING, SEED, meshes=False)
+    write_specimen(scans, petals, OPENING, SEED, finder=RangeFinder(points=points), meshes=False)
     import_petals(tuple(map(str, sorted(scans.glob("*.abs")))), str(flower), bases={}, simulated=True)
     shutil.copy(scans / "placement.toml", flower / "placement.toml")
     assembly = put_together(flower)
@@ -75,7 +84,7 @@ def build_rose(flower: Path, petals: int) -> bool:
     return assembly.state == "free"
 
 
-def picture_rose(flower: Path, fits: dict[str, StoredFit], workspace: Workspace) -> Path:
+def picture_rose(flower: Path, fits: dict[str, StoredFit], workspace: Workspace, size: int, samples: int) -> Path:
     """Draw the flower's figures and take its picture with the reflectance of Rote Rose; return the picture."""
     from render.images import write_exr, write_png
     from render.raycast import Raycaster
@@ -88,10 +97,10 @@ def picture_rose(flower: Path, fits: dict[str, StoredFit], workspace: Workspace)
         shade_of(fit, workspace)
     with steps("ray-casting") as progress:
         progress(0, 2, "figures 11, 13, 14")
-        _, contrasts = draw_flower(flower, fits, folder, marks=marks, workspace=workspace)
+        _, contrasts = draw_flower(flower, fits, folder, marks=marks, workspace=workspace, side=round(FIGURES * size))
         progress(1, 2, "the rose")
         raycaster = Raycaster(read_flower(flower))
-        picture = take(raycaster, frame(raycaster, SIDE, SIDE), shade_of(fits["RR"], workspace), samples=9)
+        picture = take(raycaster, frame(raycaster, size, size), shade_of(fits["RR"], workspace), samples=samples)
     click.echo("\n" + contrasts)
     path = folder / "rose.png"
     write_png(marked(show(picture, "RR"), marks), path)

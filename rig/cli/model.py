@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fitting.model import Model
 
 MODES = ("paper", "radiometric", "interreflecting", "body")
+FORMATS = ("png", "svg")
 
 
 class WithNumbers(click.Command):
@@ -208,13 +209,14 @@ Examples:
   rig model show
   rig model show --mode body --aspect 1.9 --set mu=1 --set R_m=0.4 --set T_m=0.2
   rig model show --mode interreflecting --theta-i 60 --out pages/ --json
-  rig model show rose.npz --width 25""",
+  rig model show rose.npz --width 25 --format svg""",
 )
 @click.argument("file", required=False, metavar="[FILE.npz]", type=click.Path(path_type=Path))
 @click.option("--mode", type=click.Choice(MODES), help="Draw this one [default: paper, and all four side by side].")
 @click.option("--theta-i", type=click.FloatRange(0, 85), default=45.0, show_default=True, metavar="DEG", help="Angle of the light.")
 @click.option("--width", type=click.FloatRange(0, min_open=True), default=20.0, show_default=True, metavar="UM", help="Width of a cell.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), metavar="DIR", help="Where to draw [default: in figures/].")
+@click.option("--format", "formats", type=click.Choice(FORMATS), multiple=True, help="Draw as this; repeatable [default: both].")
 @geometry
 @NUMBER
 @click.option("--json", "as_json", is_flag=True, help="For programs: paths and the ablation's table.")
@@ -226,6 +228,7 @@ def show(
     theta_i: float,
     width: float,
     out: Path | None,
+    formats: tuple[str, ...],
     sets: tuple[str, ...],
     as_json: bool,
     **options: Any,
@@ -254,7 +257,8 @@ def show(
     x = _numbers(model.mode, sets)
     folder = out or settings.workspace.figures / f"model-{name}"
     parts = ablations(model, x, theta_i, others)
-    written = draw_model(model, x, folder, theta_i=theta_i, width=width, others=others, ablations=parts)
+    kinds = tuple(kind for kind in FORMATS if kind in (formats or FORMATS))
+    written = draw_model(model, x, folder, theta_i=theta_i, width=width, others=others, ablations=parts, formats=kinds)
     if as_json:
         click.echo(json.dumps({"files": [str(path) for path in written], "numbers": x, "ablation": [part.to_dict() for part in parts]}))
         return

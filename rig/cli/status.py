@@ -30,6 +30,8 @@ def command(settings: Settings, axes: tuple[str, ...], as_json: bool, trace: str
     else:
         for row in rows:
             click.echo(f"{mark(config)}{_line(row)}")
+            for notice in row.get("notices", ()):
+                click.echo(f"note: {notice}", err=True)
     if any(row["error"] for row in rows):
         sys.exit(1)
 

@@ -72,11 +72,11 @@ def run_sweep(order: Order, folder: Path, workspace: Workspace, *, ask: bool | N
         try:
             measure(order, folder, screen, workspace, trace=trace)
         finally:
+            stored = (folder / "journal.jsonl").exists()
             if log := read_incidents(folder / INCIDENTS):
-                screen.console.print(
-                    f"{len(log)} troubles on the wires were dealt with, see `rig runs show`; the last: {log[-1]}", soft_wrap=True
-                )
-            if (folder / "journal.jsonl").exists():
+                where = ", see `rig runs show`" if stored else ""
+                screen.console.print(f"trouble on the wires, dealt with: {len(log)} times{where}; the last: {log[-1]}", soft_wrap=True)
+            if stored:
                 screen.console.print(f"{mark}stored in {folder}", soft_wrap=True)
             else:  # nothing was begun: no empty run is left behind
                 for name in ("config.toml", INCIDENTS):
