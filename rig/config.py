@@ -15,6 +15,7 @@ from rig.interlock import Interlock, KeepOut
 from rig.kinematics import AxisMap
 
 if TYPE_CHECKING:
+    from drivers.catalogue import Catalogue
     from drivers.kinds import Unit
     from drivers.models import DeviceModel
 
@@ -33,11 +34,15 @@ MAIN_SENSOR = "sensor"
 
 @dataclass(frozen=True)
 class AxisConfig:
-    """One axis: which stage, where it hangs, how its angle counts, where it may go (degrees, or mm of a linear one; seconds)."""
+    """One axis: which stage, where it hangs, how its angle counts, where it may go (degrees, or mm of a linear one; seconds).
+
+    `identity` says which stage it is, whatever it is called: port, model and what tells it from the others there.
+    """
 
     name: str
     model: str
     port: str
+    identity: str
     unit: "Unit"
     map: AxisMap
     limits: tuple[float, float]
@@ -47,11 +52,6 @@ class AxisConfig:
     tolerance: float
     options: Mapping[str, Any]
     serial: Mapping[str, Any]
-
-    @property
-    def identity(self) -> str:
-        """Which stage this is, whatever it is called: port, model and what tells it from the others there."""
-        return " ".join([self.port, self.model, *(f"{key}={self.options[key]}" for key in ("address", "axis") if key in self.options)])
 
 
 @dataclass(frozen=True)
@@ -158,19 +158,22 @@ def parse_config(text: str, source: str) -> BenchConfig:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as exc:
         raise ConfigError(f"{source}: not TOML: {exc}") from exc
+    from drivers import catalogue
+
+    models = catalogue.load()
     top = _Table(document, source, "")
     bench = top.table("bench", required=False)
     name = bench.text("name", default="bench")
     bench.done()
     simulation = _simulation(top.table("simulation")) if "simulation" in document else None
     axes = top.table("axes")
-    axis_configs = {axis: _axis(axis, axes.table(axis)) for axis in (*ANGLES, *axes.names(but=ANGLES))}
-    sensors = {MAIN_SENSOR: _sensor(MAIN_SENSOR, top.table("sensor"))}
+    axis_configs = {axis: _axis(axis, axes.table(axis), models) for axis in (*ANGLES, *axes.names(but=ANGLES))}
+    sensors = {MAIN_SENSOR: _sensor(MAIN_SENSOR, top.table("sensor"), models)}
     others = top.table("sensors", required=False)
     for sensor in others.names():
         if sensor in (MAIN_SENSOR, *axis_configs):
             raise others.error(sensor, "this name is taken")
-        sensors[sensor] = _sensor(sensor, others.table(sensor))
+        sensors[sensor] = _sensor(sensor, others.table(sensor), models)
     config = BenchConfig(
         name=name,
         axes=axis_configs,
@@ -181,13 +184,13 @@ def parse_config(text: str, source: str) -> BenchConfig:
         source=source,
     )
     top.done()
-    _check_ports(config)
+    _check_ports(config, models)
     return config
 
 
-def _axis(name: str, table: "_Table") -> AxisConfig:
+def _axis(name: str, table: "_Table", models: "Catalogue") -> AxisConfig:
     kinds = ("rotary-axis",) if name in ANGLES else ("rotary-axis", "linear-axis")
-    model, options, serial = _device(table, kinds, frozenset({"speed", "acceleration"}))
+    model, options, serial = _device(table, models, kinds, frozenset({"speed", "acceleration"}))
     unit: Unit = "mm" if model.kind == "linear-axis" else "deg"
     low, high = table.pair("limits", unit)
     if low >= high:
@@ -199,6 +202,7 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
         name=name,
         model=model.name,
         port=table.text("port"),
+        identity=" ".join([table.text("port"), model.name, *(f"{key}={value}" for key, value in _place(model, options).items())]),
         unit=unit,
         map=AxisMap(int(sign), table.number("offset", default=0.0)),
         limits=(low, high),
@@ -213,10 +217,10 @@ def _axis(name: str, table: "_Table") -> AxisConfig:
     return config
 
 
-def _sensor(name: str, table: "_Table") -> SensorConfig:
+def _sensor(name: str, table: "_Table", models: "Catalogue") -> SensorConfig:
     main = name == MAIN_SENSOR
     kinds = ("light-sensor",) if main else ("light-sensor", "range-finder")
-    model, options, serial = _device(table, kinds, frozenset({"integration_s", "range"}))
+    model, options, serial = _device(table, models, kinds, frozenset({"integration_s", "range"}))
     light = model.kind == "light-sensor"
     told = model.options.get("integration_s")
     config = SensorConfig(
@@ -249,12 +253,12 @@ def _simulation(table: "_Table") -> Simulation:
     return simulation
 
 
-def _device(table: "_Table", kinds: tuple[str, ...], owned: frozenset[str]) -> tuple["DeviceModel", dict[str, Any], dict[str, Any]]:
+def _device(
+    table: "_Table", models: "Catalogue", kinds: tuple[str, ...], owned: frozenset[str]
+) -> tuple["DeviceModel", dict[str, Any], dict[str, Any]]:
     """Return the model, its own options and the line settings that `table` gives; `owned` options have keys of ours."""
-    from drivers import catalogue
     from drivers.errors import InvalidSetting
 
-    models = catalogue.load()
     known = sorted(name for name, model in models.models.items() if model.kind in kinds)
     name = table.text("model")
     if name not in known:
@@ -278,7 +282,7 @@ def _device(table: "_Table", kinds: tuple[str, ...], owned: frozenset[str]) -> t
     return model, options, line
 
 
-def _check_ports(config: BenchConfig) -> None:
+def _check_ports(config: BenchConfig, models: "Catalogue") -> None:
     keys = {**{name: f"axes.{name}" for name in config.axes}, **{name: f"sensors.{name}" for name in config.sensors}, MAIN_SENSOR: "sensor"}
     simulation = config.simulation
     started = simulation is not None and not simulation.served
@@ -291,25 +295,24 @@ def _check_ports(config: BenchConfig) -> None:
             raise ConfigError(f"{config.source}: {keys[name]}.port: {device.port!r} must be {what}")
     for first, second in combinations(config.devices.values(), 2):
         if first.port == second.port:
-            _check_neighbours(f"{config.source}: {keys[second.name]}", keys[first.name], second, first)
+            _check_neighbours(f"{config.source}: {keys[second.name]}", keys[first.name], second, first, models)
 
 
-def _check_neighbours(where: str, first: str, device: AxisConfig | SensorConfig, other: AxisConfig | SensorConfig) -> None:
+def _check_neighbours(
+    where: str, first: str, device: AxisConfig | SensorConfig, other: AxisConfig | SensorConfig, models: "Catalogue"
+) -> None:
     """Raise ConfigError where two devices cannot share the port they name."""
-    from drivers import catalogue
-
-    models = catalogue.load()
     one, two = (models.lookup(each.model) for each in (other, device))
     if one.open_port != two.open_port or {**one.line, **other.serial} != {**two.line, **device.serial}:
         raise ConfigError(f"{where}.port: {device.port!r} is the port of {first}, whose line settings or protocol are others")
-    if _place(one, other) == _place(two, device):
+    if _place(one, other.options) == _place(two, device.options):
         key = "address" if "address" in two.options else "axis"
         raise ConfigError(f"{where}.{key}: the same instrument as {first}; give each its own address, axis or port")
 
 
-def _place(model: "DeviceModel", device: AxisConfig | SensorConfig) -> dict[str, Any]:
+def _place(model: "DeviceModel", options: Mapping[str, Any]) -> dict[str, Any]:
     """Return what tells a device from the others on its port."""
-    return {key: device.options.get(key, model.options[key].default) for key in ("address", "axis") if key in model.options}
+    return {key: options.get(key, model.options[key].default) for key in ("address", "axis") if key in model.options}
 
 
 class _Table:

@@ -259,7 +259,7 @@ class Axis(Configured):
     def _move(self, target: float, stopped: threading.Event) -> Task:
         goal = self.map.to_axis(target)
         state = self.refresh()
-        if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance:
+        if state.homed and not state.moving and abs(self._readback - target) <= self.tolerance and self._is_at(goal):
             return
         duration = self._profile.duration_s(abs(self._readback - target))
         if not self._started(lambda: self.driver.start_move(goal), goal, state, stopped):
@@ -283,6 +283,14 @@ class Axis(Configured):
         self._remember(None, self.refresh(), under_way=False)
         if not stopped.is_set() and not self._homed:
             raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
+
+    def _is_at(self, goal: float) -> bool:
+        """Look once more before a motion is left out: the first look may have been a late answer."""
+        try:
+            self.driver.check_arrival(goal, self.tolerance)
+        except DeviceFault:
+            return False
+        return True
 
     def _settled(self, goal: float) -> AxisState:
         """Look where the arm stands for the record: what looks different from what was made sure of may be a late answer, once."""

@@ -102,5 +102,14 @@ def _line(row: dict[str, Any]) -> str:
         return f"{head}: {row['error']}"
     identity = row["identity"]
     who = f"{identity['vendor']} {identity['model']}, serial number {identity['serial_number']}, firmware {identity['firmware']}"
-    state = ", ".join(f"{key} {value}" for key, value in row["state"].items())
-    return f"{head}: {who}; {state}"
+    return f"{head}: {who}; {', '.join(_said(key, value) for key, value in row['state'].items())}"
+
+
+def _said(key: str, value: Any) -> str:
+    match value:
+        case bool():
+            return key if value else f"not {key}"
+        case list():
+            return f"{key} {' '.join(value) or 'none'}"
+        case _:
+            return f"{key} {value}"

@@ -1,4 +1,4 @@
-"""What every light sensor owes, for those that integrate as they please and measure light itself, not a current."""
+"""What light sensors owe that integrate as they please and measure light itself, not a current: with their light in our hands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from drivers.errors import PortClosed
 from drivers.kinds import LightSensor
 from drivers.link import Link
 from drivers.modbus import ModbusLink
@@ -21,18 +20,7 @@ from sim.apogee import QuantumModel, QuantumSensor
 from sim.clock import SimClock
 from sim.konica_minolta import Photometer, PhotometerModel
 from sim.modbus import ModbusBus
-from tests.conformance.test_light_sensor import (
-    test_a_reading_is_a_finite_number_with_a_unit,
-    test_an_impossible_integration_time_is_refused,
-    test_it_says_who_it_is,
-)
 from tests.sim.served import served
-
-__all__ = [
-    "test_a_reading_is_a_finite_number_with_a_unit",
-    "test_an_impossible_integration_time_is_refused",
-    "test_it_says_who_it_is",
-]
 
 SPEED = 200.0
 
@@ -131,9 +119,3 @@ def test_too_bright_is_never_a_good_value(sensor: LightSensor, light: Light) -> 
     while not (reading := sensor.read()).good:
         pass
     assert reading.value == pytest.approx(100.0, rel=0.005)
-
-
-def test_closed_is_closed(sensor: LightSensor) -> None:
-    sensor.close()
-    with pytest.raises(PortClosed, match="sensor"):
-        sensor.read()

@@ -10,15 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from drivers import catalogue
 from drivers.errors import InvalidSetting, PortClosed
-from drivers.kinds import DistanceReading, RangeFinder
+from drivers.kinds import DistanceReading, RangeFinder, Stage
 from drivers.modbus import ModbusLink
+from drivers.motion import wait_until_idle
 from drivers.rangefinders.baumer_om import BaumerOM
 from drivers.rangefinders.optoncdt1420 import OptoNCDT1420, StreamLink
+from rig.clock import Clock
 from sim.baumer import DistanceSensor, RangeModel
 from sim.clock import SimClock
 from sim.modbus import ModbusBus
 from sim.optoncdt import OptoNCDT, TriangulationModel
+from sim.serve import Running
+from tests.conformance.conftest import FINDERS, SPEED, STAGES, opened
 from tests.sim.served import served
 
 START_MM = 45.0
@@ -59,14 +64,14 @@ def baumer(target: Target) -> Iterator[Callable[[], RangeFinder]]:
         yield lambda: BaumerOM.open(link, "range")
 
 
-FINDERS = {"micro-epsilon-ild1420": optoncdt, "baumer-om20": baumer}
+OVER_A_TARGET = {"micro-epsilon-ild1420": optoncdt, "baumer-om20": baumer}
 
 
-@pytest.fixture(scope="module", params=FINDERS)
+@pytest.fixture(scope="module", params=OVER_A_TARGET)
 def port(request: pytest.FixtureRequest) -> Iterator[tuple[Callable[[], RangeFinder], Target]]:
     """What opens a range finder on its port, and what it looks at; ports are slow to close."""
     target = Target()
-    with FINDERS[request.param](target) as connect:
+    with OVER_A_TARGET[request.param](target) as connect:
         yield connect, target
 
 
@@ -78,6 +83,10 @@ def bench(port: tuple[Callable[[], RangeFinder], Target]) -> Bench:
     finder = connect()
     assert isinstance(finder, RangeFinder)
     return Bench(finder, target)
+
+
+def test_every_range_finder_of_the_catalogue_is_here() -> None:
+    assert set(FINDERS) == {model.name for model in catalogue.BUILT_IN if model.kind == "range-finder"}
 
 
 def test_it_says_who_it_is(bench: Bench) -> None:
@@ -120,10 +129,47 @@ def test_its_readings_scatter_little(bench: Bench) -> None:
     assert 0 < np.std(values) < 0.02
 
 
-def test_closed_is_closed(bench: Bench) -> None:
-    bench.finder.close()
+def test_closed_is_closed(finder: RangeFinder) -> None:
+    assert all(vars(finder.identify()).values())
+    finder.close()
     with pytest.raises(PortClosed, match="range"):
-        bench.finder.read()
+        finder.read()
+
+
+@pytest.fixture
+def carriage(world: Running) -> Iterator[Callable[[float], None]]:
+    """Send the plate that all range finders of the world look at to a position, mm."""
+    with opened(world, "zaber-x-lsm", STAGES["zaber-x-lsm"], "carriage") as stage:
+        assert isinstance(stage, Stage)
+        stage.set_profile(speed=100.0, acceleration=1000.0)
+        if not stage.state().homed:
+            stage.start_home()
+            wait_until_idle(stage, 0.0, timeout_s=120.0, clock=Clock(SPEED))
+
+        def send(position: float) -> None:
+            stage.start_move(position)
+            wait_until_idle(stage, 0.0, timeout_s=30.0, clock=Clock(SPEED))
+            stage.check_arrival(position, 0.01)
+
+        yield send
+
+
+def test_it_sees_the_plate_go(finder: RangeFinder, carriage: Callable[[float], None], world: Running) -> None:
+    near_mm, far_mm = finder.limits_mm()
+    carriage(5.0)
+    first = finder.read()
+    assert first.good
+    assert near_mm < first.distance_mm < far_mm
+    for gone in (3.0, 20.0, 35.0):
+        carriage(5.0 + gone)
+        reading = finder.read()
+        assert reading.good
+        assert reading.distance_mm - first.distance_mm == pytest.approx(gone, abs=0.1)
+    carriage(145.0)
+    lost = finder.read()
+    assert (lost.good, lost.distance_mm) == (False, math.inf)
+    carriage(5.0)
+    assert finder.read().distance_mm == pytest.approx(first.distance_mm, abs=0.1)
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ def test_a_port_that_is_silent(rig, tmp_path: Path) -> None:
         )
         (tmp_path / "rig.toml").write_text(text)
         done = rig("sweep", "--cultivar", "RR", check=1)
-    assert re.search(r"TransportTimeout: meter on socket://localhost:\d+: .*no reply", done.stderr)
+    assert re.search(r"TransportTimeout: sensor on socket://localhost:\d+: .*no reply", done.stderr)
 
 
 def test_init_writes_once(rig, tmp_path: Path) -> None:

@@ -12,8 +12,9 @@ from bluesky.simulators import check_limits
 
 from drivers.errors import DeviceFault
 from rig.bench import Bench
-from rig.engine import Interrupts, run_plan
+from rig.engine import run_plan
 from rig.errors import InterlockError, Interrupted
+from rig.interrupts import Interrupts
 from rig.journal import JournalWriter, read_documents
 from rig.plans import sweep
 from rig.trajectory import Trajectory

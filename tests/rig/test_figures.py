@@ -21,7 +21,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
     folder = tmp_path_factory.mktemp("demo")
     done = subprocess.run(
-        [sys.executable, "-m", "rig", "demo", "--petals", "5"], cwd=folder, env=rig_environment(), capture_output=True, text=True
+        [sys.executable, "-m", "rig", "demo", "--petals", "5", "--points", "3000", "--size", "200", "--samples", "1"], cwd=folder, env=rig_environment(), capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return folder / "rig-data", done.stdout
