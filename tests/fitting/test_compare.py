@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fitting import ladder, radiometric
 from fitting.compare import Comparison, RungResult, compare
 from fitting.errors import FitError, ReadingError
 from fitting.fit import fit
@@ -24,9 +26,25 @@ EFFORT = Effort(global_evaluations=40)
 
 
 @pytest.fixture(scope="module")
-def traces() -> Traces:
-    """Tracing is what is slow."""
-    return Traces()
+def once() -> Iterator[None]:
+    """All petals are read in the same directions: terms of one shape are integrated for the first of them only."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module, name in ((radiometric, "radiometric_terms"), (radiometric, "paper_terms_any"), (ladder, "paper_terms")):
+            patch.setattr(module, name, kept(getattr(module, name)))
+        yield
+
+
+def kept(terms: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """Return the function with a memory."""
+    known: dict[Any, np.ndarray] = {}
+
+    def asked(*angles: np.ndarray, **settings: Any) -> np.ndarray:
+        key = tuple(np.asarray(angle).tobytes() for angle in angles), tuple(sorted(settings.items()))
+        if key not in known:
+            known[key] = terms(*angles, **settings)
+        return known[key].copy()
+
+    return asked
 
 
 def made(
@@ -275,6 +293,7 @@ def petal(name: str) -> Measurements:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["BR", "RR", "PR", "WR"])
+@pytest.mark.usefixtures("once")
 def test_virtual_petals(name: str, traces: Traces) -> None:
     """Mean E 10 % or less at 45 deg, 15 % or less at incidences left out, by what the data support; the paper's rung is beside it."""
     readings = petal(name)

@@ -38,8 +38,8 @@ def shades() -> dict[str, Reflectance]:
     mirror = np.maximum(0, np.cos(i) * np.cos(r) - np.sin(i) * np.sin(r) * np.cos(p))
     spot = np.zeros((len(THETA), len(THETA), len(PHI)))
     spot[:, 9, 14] = 1  # dark all round
-    petal = paper_table(Cell(1.2), grid=Grid(theta_steps=15, phi_steps=18))
-    tall = radiometric_table(Cell(1.9), grid=Grid(theta_steps=15, phi_steps=18))
+    petal = paper_table(Cell(1.2), n_us=12, grid=Grid(theta_steps=12, phi_steps=12))
+    tall = radiometric_table(Cell(1.9), n_us=12, grid=Grid(theta_steps=12, phi_steps=12))
     return {
         "lambert": one(0.8 / math.pi),
         "black": one(0.0),

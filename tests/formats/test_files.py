@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fitting.errors import DomainError, FitError, TableError
+from fitting.formats import files
 from fitting.formats.about import about
 from fitting.formats.files import FORMATS, ChannelError, Data, format_named, format_of, listed_of, read_any, write_any
 from fitting.formats.grid import Brdf, Scattered, ask
@@ -65,10 +68,23 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, .
     return {kind: write_any(folder / name, grey).paths for kind, name in NAMES.items()}
 
 
+@pytest.fixture(scope="module")
+def found(sources: dict[str, tuple[Path, ...]]) -> Callable[[str], Data]:
+    """The same, each read when first asked for."""
+    return functools.cache(lambda kind: back(sources[kind]))
+
+
+@pytest.fixture
+def coarse_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Klems matrices are means of 16 samples, not 256; how good these are is test_klems' business."""
+    monkeypatch.setattr(files, "write_klems", functools.partial(files.write_klems, samples=2))
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse_patches")
 @pytest.mark.parametrize(("kind", "to"), [pair for pair in itertools.product(READABLE, FORMATS) if pair[0] != pair[1]])
-def test_every_format_into_every_other(sources: dict[str, tuple[Path, ...]], tmp_path: Path, kind: str, to: str) -> None:
-    data = back(sources[kind])
+def test_every_format_into_every_other(found: Callable[[str], Data], tmp_path: Path, kind: str, to: str) -> None:
+    data = found(kind)
     written = write_any(tmp_path / NAMES[to], data, beyond="nearest", channel="G" if len(data.channels) == 3 else None)
     assert written.format == to
     if to == "zemax":
@@ -126,9 +142,10 @@ def test_radiance_reads_what_was_readings(sources: dict[str, tuple[Path, ...]], 
     assert np.median(found / expected) == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.usefixtures("coarse_patches")
 @pytest.mark.parametrize("to", ["rgl", "klems", "zemax"])
-def test_nothing_is_made_up_beyond_the_readings(sources: dict[str, tuple[Path, ...]], tmp_path: Path, to: str) -> None:
-    data = back(sources["csv"])
+def test_nothing_is_made_up_beyond_the_readings(found: Callable[[str], Data], tmp_path: Path, to: str) -> None:
+    data = found("csv")
     with pytest.raises(BeyondError, match=r"theta_[ir] = [89]\d\S* deg is outside the grid, which has 0 to 8[05] deg.*nearest or zero"):
         write_any(tmp_path / NAMES[to], data)
     assert not list(tmp_path.iterdir())
@@ -334,6 +351,7 @@ def test_tables_of_factors_are_divided_and_relative_ones_refused(tmp_path: Path)
         read_any(tmp_path / "b.csv")
 
 
+@pytest.mark.usefixtures("coarse_patches")
 def test_what_goes_through(tmp_path: Path) -> None:
     behind = Brdf.sampled(forward, np.arange(0, 91, 5.0), np.arange(90, 181, 5.0), np.arange(0, 360, 5.0), quantity="btdf")
     written = write_any(tmp_path / "a.xml", behind)

@@ -10,6 +10,7 @@ import pytest
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # the first kernels of a new installation are compiled by the demo
 NUMBERS = (1, 2, 6, 7, 8, 9)
+POINTS, SIZE = 3000, 200
 
 
 @pytest.fixture(scope="module")
@@ -20,9 +21,8 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     from tests.conftest import rig_environment
 
     folder = tmp_path_factory.mktemp("demo")
-    done = subprocess.run(
-        [sys.executable, "-m", "rig", "demo", "--petals", "5", "--points", "3000", "--size", "200", "--samples", "1"], cwd=folder, env=rig_environment(), capture_output=True, text=True
-    )
+    small = ("--petals", "5", "--points", str(POINTS), "--size", str(SIZE), "--samples", "1")
+    done = subprocess.run([sys.executable, "-m", "rig", "demo", *small], cwd=folder, env=rig_environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return folder / "rig-data", done.stdout
 
@@ -88,6 +88,9 @@ def test_the_demo_goes_on_to_a_rose_that_nobody_put_together(demo: tuple[Path, s
     assert assembled["state"] == "free"
     assert len(assembled["petals"]) == 5
     assert f"no two petals intersect; clearance {assembled['clearance_mm']:.3f} mm" in said
+    scanned = [int(points) for points in re.findall(r"^P0\d +(\d{4}) +\d{4} ", said, re.MULTILINE)]
+    assert scanned == pytest.approx([POINTS] * 5, rel=0.05)
+    assert cv2.imread(str(workspace / "figures" / "rose.png")).shape == (SIZE, SIZE, 3)
     for name in ("figure-11.png", "figure-13.png", "figure-14.png", "rose.png"):
         picture = cv2.imread(str(workspace / "figures" / name))
         # More than paper or background: a good part of the picture is something else than its commonest colour.

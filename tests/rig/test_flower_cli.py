@@ -2,25 +2,22 @@
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rig.flowerpages import Saving, open_flower
-from tests.conftest import ROOT, rig_environment
+from sim.rose import RangeFinder, write_specimen
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def rose(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A virtual rose of five petals, scanned."""
+    """A virtual rose of five petals, scanned coarsely."""
     folder = tmp_path_factory.mktemp("rose")
-    command = [sys.executable, "-m", "sim.rose", "--petals", "5", "--seed", "2", "--out", str(folder)]
-    subprocess.run(command, check=True, cwd=ROOT, capture_output=True, env=rig_environment())
+    write_specimen(folder, 5, seed=2, finder=RangeFinder(points=3000), meshes=False)
     return folder
 
 
@@ -30,7 +27,7 @@ def test_from_scans_to_a_picture(rig, rose: Path, tmp_path: Path) -> None:
     scans = [str(path) for path in sorted(rose.glob("*.abs"))]
     quality = json.loads(rig("scan", "import", *scans, "--flower", "flower", "--simulated", "--json").stdout)
     assert list(quality) == [f"P0{n}" for n in range(1, 6)]
-    assert all(9000 <= petal["points"] <= 13_000 for petal in quality.values())
+    assert all(2700 <= petal["points"] <= 3300 for petal in quality.values())
 
     # Without a placement every petal lacks one; with the measured one nothing is wrong.
     problems = json.loads(rig("flower", "check", "flower", "--json", check=1).stdout)
@@ -61,7 +58,8 @@ def test_from_scans_to_a_picture(rig, rose: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "flower" / "assembly.json").read_text()) == kept
 
     (tmp_path / "t.csv").write_text("theta_i,theta_r,value\n" + "".join(f"45,{t},{20 + 10 * (t > 0)}\n" for t in range(-60, 61, 20)))
-    fit = json.loads(rig("fit", "t.csv", "--json").stdout)["id"]
+    # The demo takes its picture with the paper's model; this one is tabulated in no time.
+    fit = json.loads(rig("fit", "t.csv", "--model", "phong", "--json").stdout)["id"]
     rig("render", "flower", "--fit", fit, "--size", "120x100", "--samples", "1", "--out", "p.png", timeout=120)
     import cv2
 
