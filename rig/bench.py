@@ -10,10 +10,11 @@ from drivers.errors import DeviceError
 from drivers.incidents import Report
 from drivers.kinds import LightSensor, RangeFinder, Stage
 from rig.axisrecord import AxisRecords
+from rig.brake import Brake
 from rig.clock import Clock
 from rig.config import ANGLES, MAIN_SENSOR, AxisConfig, BenchConfig, SensorConfig
 from rig.devices import Axis, LightMeter, Ranger
-from rig.errors import ConfigError
+from rig.errors import ConfigError, InterlockError, RigError
 from rig.ports import Ports, open_ports
 from rig.trace import Trace
 
@@ -49,6 +50,7 @@ class Bench:
     config: BenchConfig
     clock: Clock
     simulation: Mapping[str, Any] | None
+    brake: Brake = field(default_factory=Brake)
     axes: dict[str, Axis] = field(default_factory=dict)
     sensors: dict[str, LightMeter | Ranger] = field(default_factory=dict)
 
@@ -69,7 +71,16 @@ class Bench:
         """What somebody should know before anything moves."""
         return [notice for axis in self.axes.values() for notice in axis.notices]
 
-    def stop(self) -> list[DeviceError]:
+    def halt(self) -> list[Exception]:
+        """Let nothing begin any more, and stop every axis; return what could not be told to stop. Safe from any thread."""
+        self.brake.apply()
+        return self.stop()
+
+    def release(self) -> None:
+        """Let motions and readings begin again."""
+        self.brake.release()
+
+    def stop(self) -> list[Exception]:
         """Stop every axis at once; return what could not be told to stop. Safe from any thread.
 
         No axis waits for another's answer: a silent wire must not delay the stop on the next one.
@@ -84,10 +95,10 @@ class Bench:
         return {name: axis.destination for name, axis in self.axes.items()}
 
 
-def _stop(axis: Axis) -> DeviceError | None:
+def _stop(axis: Axis) -> Exception | None:
     try:
         axis.stop()
-    except DeviceError as exc:
+    except Exception as exc:  # whatever is wrong with one axis must not keep the stop from the others
         return exc
     return None
 
@@ -128,7 +139,7 @@ def open_bench(
         for name in (*wanted, *chosen):  # a port that cannot be opened is found before any instrument is set
             ports.on(config.devices[name])
         for name in wanted:
-            bench.sensors[name] = _sensor(ports, config.sensors[name])
+            bench.sensors[name] = _sensor(ports, config.sensors[name], bench.brake)
         stack.push(lambda kind, exc, trace: _leave_stopped(bench, exc))
         for name in chosen:
             bench.axes[name] = _axis(ports, config.axes[name], bench, paperwork)
@@ -143,23 +154,22 @@ def _leave_stopped(bench: Bench, exc: BaseException | None) -> None:
         return
     warning = f"AND NOT EVERY AXIS COULD BE STOPPED, it may still be moving: {'; '.join(map(str, failures))}"
     if exc is None:
-        failures[0].hint = warning
-        raise failures[0]
+        raise RigError(warning) from failures[0]
     if isinstance(exc, DeviceError):
         exc.hint = f"{exc.hint}; {warning}" if exc.hint else warning
     else:
         exc.add_note(warning)
 
 
-def _sensor(ports: Ports, config: SensorConfig) -> LightMeter | Ranger:
+def _sensor(ports: Ports, config: SensorConfig, brake: Brake) -> LightMeter | Ranger:
     driver, worker = ports.open(config)
     name = READING if config.name == MAIN_SENSOR else config.name
     if isinstance(driver, LightSensor):
         assert config.integration_s is not None
         driver.configure(config.integration_s, config.range)
-        return LightMeter(name, driver, worker)
+        return LightMeter(name, driver, worker, brake)
     if isinstance(driver, RangeFinder):
-        return Ranger(name, driver, worker)
+        return Ranger(name, driver, worker, brake)
     raise ConfigError(f"{ports.config.source}: {config.name}: {config.model} is no sensor")
 
 
@@ -171,6 +181,11 @@ def _axis(ports: Ports, config: AxisConfig, bench: Bench, paperwork: Paperwork) 
     interlock = ports.config.interlock
 
     def check(axis: str, target: float) -> None:
+        interlock.check_limits(axis, target)
+        for other in interlock.arms if axis in interlock.arms else ():
+            if other != axis and not bench.axes[other].homed:
+                unknown = f"{other} has no reference, so nobody knows how close {axis} would come to it"
+                raise InterlockError(f"{unknown}; nothing was moved. `rig home {other}` first")
         interlock.check_move(bench.position(), axis, target)
 
     return Axis(
@@ -180,6 +195,7 @@ def _axis(ports: Ports, config: AxisConfig, bench: Bench, paperwork: Paperwork) 
         config.map,
         worker,
         ports.clock,
+        bench.brake,
         settle_s=config.settle_s,
         tolerance=config.tolerance,
         limits=config.limits,

@@ -13,8 +13,9 @@ from typing import Any, Generic, TypeVar
 
 from drivers.errors import BadChecksum, DeviceError, DeviceFault, MoveTimeout, NotHomed, TransportTimeout, UnexpectedReply
 from drivers.incidents import Incident, Report, What
-from drivers.kinds import AxisState, DistanceReading, LightReading, LightSensor, RangeFinder, Stage
+from drivers.kinds import AxisState, DistanceReading, ForgetfulStage, LightReading, LightSensor, RangeFinder, Stage
 from rig.axisrecord import AxisMemory, AxisRecord, recollected
+from rig.brake import Brake
 from rig.bus import BusWorker, Task
 from rig.clock import Clock
 from rig.errors import InterlockError
@@ -26,6 +27,9 @@ POLL_S = 0.004
 
 WATCH_S = 0.05
 """How often an axis on its way is looked at, s of the bench's time."""
+
+OFF_ZERO = 0.1
+"""How far from the origin, in its unit, an axis is left whose controller forgets that it was homed."""
 
 LOOKS = 2
 """How often an arm that has settled is looked at before it counts as elsewhere."""
@@ -84,6 +88,8 @@ class Axis(Configured):
     bus : BusWorker
         The worker of the port the stage hangs on.
     clock : Clock
+    brake : Brake
+        Holds motions back while the bench is stopped.
     settle_s : float
         How long the arm rings after the stage has arrived.
     tolerance : float
@@ -113,6 +119,7 @@ class Axis(Configured):
         axis_map: AxisMap,
         bus: BusWorker,
         clock: Clock,
+        brake: Brake,
         *,
         settle_s: float,
         tolerance: float,
@@ -131,6 +138,7 @@ class Axis(Configured):
         self.homing = Homing(self)
         self._bus = bus
         self._clock = clock
+        self._brake = brake
         self._check = check
         self._memory = memory
         self._report = report or (lambda incident: None)
@@ -250,6 +258,9 @@ class Axis(Configured):
     # -- motion --------------------------------------------------------------------------------------------------------
 
     def _begin(self, task: Callable[[threading.Event], Task], target: float) -> Status:
+        return self._brake.pass_or_hold(lambda: self._launch(task, target))
+
+    def _launch(self, task: Callable[[threading.Event], Task], target: float) -> Status:
         # A motion that was told to stop may still be under way on the bus when the next one begins: each has its own flag.
         self._stopped = threading.Event()
         self._setpoint = target
@@ -280,6 +291,8 @@ class Axis(Configured):
         yield from self._until_idle("homing", self._profile.duration_s(farthest), stopped, way=None)
         if not stopped.is_set():
             yield self.settle_s
+            if isinstance(self.driver, ForgetfulStage) and self.refresh().homed:
+                yield from self._leave_zero(stopped)
         self._remember(None, self.refresh(), under_way=False)
         if not stopped.is_set() and not self._homed:
             raise NotHomed("homing ended without a reference", device=self.name, hint="look at the stage's warnings and home it again")
@@ -291,6 +304,15 @@ class Axis(Configured):
         except DeviceFault:
             return False
         return True
+
+    def _leave_zero(self, stopped: threading.Event) -> Task:
+        """Step off the origin: where a counter reads 0 it may also have been switched off, and the record could not vouch for it."""
+        step = math.copysign(max(OFF_ZERO, 5 * self.tolerance), self.map.to_axis(sum(self.limits) / 2))
+        state = self.refresh()
+        if self._started(lambda: self.driver.start_move(step), step, state, stopped):
+            here = self._readback
+            duration = self._profile.duration_s(abs(step))
+            yield from self._until_idle("the step off the origin", duration, stopped, way=(here, self.map.to_theta(step)))
 
     def _settled(self, goal: float) -> AxisState:
         """Look where the arm stands for the record: what looks different from what was made sure of may be a late answer, once."""
@@ -425,9 +447,10 @@ class Sensor(Configured, Generic[R]):
 
     unit: str
 
-    def __init__(self, name: str, bus: BusWorker) -> None:
+    def __init__(self, name: str, bus: BusWorker, brake: Brake) -> None:
         self.name = name
         self._bus = bus
+        self._brake = brake
         self._last: R | None = None
         self._time = math.nan
 
@@ -458,7 +481,7 @@ class Sensor(Configured, Generic[R]):
 
     def trigger(self) -> Status:
         """Take one reading; the status ends when it is there."""
-        return self._bus.call(self._take)
+        return self._brake.pass_or_hold(lambda: self._bus.call(self._take))
 
     def _take(self) -> None:
         self._last = None
@@ -491,8 +514,8 @@ class LightMeter(Sensor[LightReading]):
 
     kind = "sensor"
 
-    def __init__(self, name: str, driver: LightSensor, bus: BusWorker) -> None:
-        super().__init__(name, bus)
+    def __init__(self, name: str, driver: LightSensor, bus: BusWorker, brake: Brake) -> None:
+        super().__init__(name, bus, brake)
         self.driver = driver
         self.unit = driver.unit
         self._identity = driver.identify()
@@ -513,8 +536,8 @@ class Ranger(Sensor[DistanceReading]):
     kind = "range-finder"
     unit = "mm"
 
-    def __init__(self, name: str, driver: RangeFinder, bus: BusWorker) -> None:
-        super().__init__(name, bus)
+    def __init__(self, name: str, driver: RangeFinder, bus: BusWorker, brake: Brake) -> None:
+        super().__init__(name, bus, brake)
         self.driver = driver
         self._identity = driver.identify()
         self._limits_mm = driver.limits_mm()

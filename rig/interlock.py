@@ -57,7 +57,7 @@ class Interlock:
     def blocked(self, position: Mapping[str, float]) -> bool:
         """Tell whether the arms, at `position`, stand inside the keep-out."""
         source, detector = (position[arm] for arm in self.arms)
-        return abs(detector - source) < self.keep_out.within_deg
+        return not abs(detector - source) >= self.keep_out.within_deg  # nan, not known, counts as too close
 
     def check_position(self, position: Mapping[str, float]) -> None:
         """Raise InterlockError where `position` (axis name to degrees) breaks a limit or lies in the keep-out."""
@@ -75,7 +75,7 @@ class Interlock:
         for axis, theta_deg in position.items():
             self.check_limits(axis, theta_deg)
         source, detector = self.arms
-        if abs(position[detector] - position[source]) < self.keep_out.shadow_deg:
+        if not abs(position[detector] - position[source]) >= self.keep_out.shadow_deg:
             raise InterlockError(
                 f"{detector} at {position[detector]:g} deg is within {self.keep_out.shadow_deg:g} deg of the {source} arm at "
                 f"{position[source]:g} deg, where it blocks the light; nothing was moved. Leave this angle out"

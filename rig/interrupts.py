@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a bench must obey them: all axes stopped first, everything else afterwards."""
+"""Ctrl-C, SIGTERM and a closed terminal as a bench must obey them: all axes stopped first, everything else afterwards."""
 
 import contextlib
 import os
@@ -25,26 +25,46 @@ class Engine(Protocol):
         """Pause at once, or at the next checkpoint."""
 
 
-class Interrupts:
-    """Turns signals into: stop all axes at once, then pause the engine, then either ask or abort.
+PAUSE = frozenset({signal.SIGINT, signal.SIGTSTP})
+"""Signals that pause and ask where somebody is at the terminal."""
 
-    The work is done on a thread of its own, woken by the C-level handler, so that neither a busy main thread nor the engine's
-    loop can delay the stop.
+ABORT = frozenset({signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT})
+"""Signals that end the work: a terminal that was closed leaves nobody to watch the arms."""
+
+
+class Interrupts:
+    """Turns signals into: stop all axes at once and pause the engine at the same time, then either ask or abort.
+
+    The work is done on threads of their own, woken by the C-level handler, so that neither a busy main thread, nor the engine's
+    loop, nor an axis that does not answer can delay the rest.
 
     Parameters
     ----------
-    stop_axes : callable
-        Puts the stop on every axis's wire; safe from any thread.
+    halt : callable
+        Lets nothing begin any more and puts the stop on every axis's wire; returns what could not be stopped. Safe from any thread.
+    release : callable
+        Lets things begin again.
     ask : bool
         True at a terminal: the first Ctrl-C pauses and asks. A second one, or SIGTERM, aborts.
+
+    Attributes
+    ----------
+    halted : threading.Event
+        Set once every axis has acknowledged its stop or has failed to.
+    unstopped : list
+        The failures.
     """
 
-    def __init__(self, stop_axes: Callable[[], Any], *, ask: bool) -> None:
+    def __init__(self, halt: Callable[[], list[Any]], release: Callable[[], Any] = lambda: None, *, ask: bool) -> None:
         self.ask = ask
         self.reason = ""
         self.pausing = threading.Event()
         self.aborting = threading.Event()
-        self._stop_axes = stop_axes
+        self.halted = threading.Event()
+        self.unstopped: list[Any] = []
+        self._halt_axes = halt
+        self._release = release
+        self._halting: list[threading.Thread] = []
         self._engine: Engine | None = None
         self._engine_lock = threading.Lock()
 
@@ -52,7 +72,7 @@ class Interrupts:
         self._reader, self._writer = os.pipe()
         os.set_blocking(self._writer, False)
         self._old_wakeup = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
-        self._old_handlers = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._old_handlers = {number: signal.signal(number, lambda *_: None) for number in PAUSE | ABORT}
         self._thread = threading.Thread(target=self._watch, name="interrupts", daemon=True)
         self._thread.start()
         return self
@@ -63,6 +83,9 @@ class Interrupts:
         signal.set_wakeup_fd(self._old_wakeup)
         os.write(self._writer, b"\0")
         self._thread.join()
+        for halting in self._halting:
+            halting.join()
+        self._release()
         os.close(self._reader)
         os.close(self._writer)
 
@@ -77,7 +100,8 @@ class Interrupts:
                 self._engine = None
 
     def go_on(self) -> None:
-        """Forget the pause that was asked for."""
+        """Forget the pause that was asked for, and let things begin again."""
+        self._release()
         self.pausing.clear()
 
     def check(self) -> None:
@@ -97,15 +121,22 @@ class Interrupts:
 
     def _watch(self) -> None:
         while (number := os.read(self._reader, 1)[0]) != 0:
-            if number not in (signal.SIGINT, signal.SIGTERM):
+            if number not in PAUSE | ABORT:
                 continue
             again = self.pausing.is_set()
             self.reason = f"interrupted by {signal.Signals(number).name}"
+            self.halted.clear()
             self.pausing.set()
-            self._stop_axes()
-            if number == signal.SIGTERM or again or not self.ask:
+            if number in ABORT or again or not self.ask:
                 self.aborting.set()
+            halting = threading.Thread(target=self._halt, name="halt", daemon=True)
+            self._halting.append(halting)
+            halting.start()
             self._pause_engine()
+
+    def _halt(self) -> None:
+        self.unstopped = self._halt_axes()
+        self.halted.set()
 
     def _pause_engine(self) -> None:
         """Ask until the engine has taken it: a request that comes between two states would be lost."""
@@ -121,8 +152,21 @@ class Interrupts:
 
 
 def ask_at_terminal(interrupts: Interrupts) -> bool:
-    """Ask the technician at the terminal whether to go on; a further signal means no."""
-    print("\npaused, all axes stopped. Go on (g) or abort (a)? ", end="", file=sys.stderr, flush=True)
+    """Ask the technician at the terminal whether to go on; a further signal means no.
+
+    An axis that could not be stopped is named, and then there is no going on.
+    """
+
+    def say(text: str) -> None:
+        print(text, end="", file=sys.stderr, flush=True)
+
+    if not interrupts.halted.is_set():
+        say("\nstopping all axes ...")
+        interrupts.halted.wait()
+    if interrupts.unstopped:
+        say(f"\nNOT EVERY AXIS COULD BE STOPPED, it may still be moving: {'; '.join(map(str, interrupts.unstopped))}\n")
+        return False
+    say("\npaused, all axes stopped. Go on (g) or abort (a)? ")
     while not interrupts.aborting.is_set():
         ready, _, _ = select.select([sys.stdin], [], [], 0.1)
         if not ready:
@@ -133,8 +177,8 @@ def ask_at_terminal(interrupts: Interrupts) -> bool:
             return False
         if word in ("g", "go", "go on"):
             return True
-        print("g to go on, a to abort: ", end="", file=sys.stderr, flush=True)
-    print(file=sys.stderr)
+        say("g to go on, a to abort: ")
+    say("\n")
     return False
 
 

@@ -145,7 +145,7 @@ def measure(order: Order, folder: Path, watcher: Watcher, workspace: Workspace, 
             **order.metadata,
         }
         with (
-            Interrupts(bench.stop, ask=watcher.ask) as interrupts,
+            Interrupts(bench.halt, bench.release, ask=watcher.ask) as interrupts,
             closing(JournalWriter(folder / "journal.jsonl", abort_reason=lambda: interrupts.reason)) as journal,
         ):
             # The journal comes first: what the watcher shows is on the disk.

@@ -113,7 +113,7 @@ def _announce(report: dict[str, Any], as_json: bool) -> None:
     """Say where the instruments are, and wait for a signal."""
     from rig.interrupts import Interrupts
 
-    with Interrupts(lambda: None, ask=False) as interrupts:
+    with Interrupts(list, ask=False) as interrupts:
         if as_json:
             click.echo(json.dumps(report))
         else:

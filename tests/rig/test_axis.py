@@ -15,6 +15,7 @@ from drivers.errors import BadChecksum, DeviceError, DeviceFault, MoveTimeout, N
 from drivers.incidents import Incident
 from drivers.kinds import AxisState, ForgetfulStage, Stage
 from rig.axisrecord import AxisRecords
+from rig.brake import Brake
 from rig.bus import BusWorker
 from rig.clock import Clock
 from rig.devices import ASTRAY, Axis
@@ -65,6 +66,7 @@ class Desk:
             axis_map,
             self.bus,
             self.clock,
+            Brake(),
             settle_s=0.01,
             tolerance=0.02,
             limits=limits,
@@ -482,3 +484,21 @@ def test_a_stage_that_knows_is_not_told(desk: Desk) -> None:
     stage = ScriptedStage()
     stage.see(AxisState(30.0, moving=False, homed=False))
     assert not desk.axis(stage).homed
+
+
+def test_homing_leaves_a_forgetful_stage_off_the_origin_so_that_the_record_can_vouch_for_it(desk: Desk) -> None:
+    stage = Forgetful()
+    stage.see(rest(5.0))
+    axis = desk.axis(stage, limits=(-85.0, 20.0))
+    axis.home().wait(10)
+    assert stage.told == [("home", None), ("move", -0.1)]  # towards the middle of where it may go
+    record = axis.last_command
+    assert record is not None
+    assert record.vouches(rest(-0.1), axis.tolerance)
+
+
+def test_a_stage_that_knows_its_reference_stays_at_the_origin(desk: Desk) -> None:
+    stage = ScriptedStage()
+    stage.see(rest(5.0))
+    desk.axis(stage).home().wait(10)
+    assert stage.told == [("home", None)]

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from bluesky import protocols
 
-from drivers.errors import DeviceError, DeviceFault, TransportTimeout
+from drivers.errors import DeviceFault, TransportTimeout
 from rig.axisrecord import AxisRecords
 from rig.bench import Bench, Paperwork, open_bench
-from rig.errors import InterlockError
+from rig.errors import InterlockError, RigError
 from rig.status import Status
 from tests.rig.scripted import ScriptedBench, ScriptedStage, moves, rest, scripted_bench
 
@@ -221,7 +221,7 @@ def test_an_error_says_that_an_axis_could_not_be_stopped(scripted: ScriptedBench
     with pytest.raises(KeyError) as caught, open_bench(scripted.config, "RR", sensors=[]):
         raise KeyError("ours")
     assert caught.value.__notes__[0].startswith("AND NOT EVERY AXIS")
-    with pytest.raises(DeviceError, match=UNSTOPPED), open_bench(scripted.config, "RR", sensors=[]):
+    with pytest.raises(RigError, match=UNSTOPPED), open_bench(scripted.config, "RR", sensors=[]):
         pass  # all went well until the end
     assert sorted(scripted.closed) == sorted(scripted.opened)
 

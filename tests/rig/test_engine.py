@@ -2,6 +2,8 @@
 
 import contextlib
 import io
+import signal
+import threading
 from pathlib import Path
 
 import bluesky.plans as bp
@@ -65,7 +67,7 @@ def test_our_sweep_stores_readback_of_all_axes_at_each_point(bench: Bench, tmp_p
 def run_sweep(bench: Bench, folder: Path, trajectory: Trajectory, *, ask: bool = False, decide=never, watch=None) -> list[tuple[str, dict]]:
     path = folder / "journal.jsonl"
     with (
-        Interrupts(bench.stop, ask=ask) as interrupts,
+        Interrupts(bench.halt, bench.release, ask=ask) as interrupts,
         contextlib.closing(JournalWriter(path, abort_reason=lambda: interrupts.reason)) as journal,
     ):
         plan = sweep(bench, trajectory, {"cultivar": "RR"})
@@ -94,8 +96,6 @@ def interrupt_at(event: int, signal_number: int):
 
 
 def test_a_pause_and_going_on_leaves_a_complete_run(bench: Bench, tmp_path: Path) -> None:
-    import signal
-
     asked: list[float] = []
 
     def go_on(interrupts: Interrupts) -> bool:
@@ -115,10 +115,59 @@ def test_a_pause_and_going_on_leaves_a_complete_run(bench: Bench, tmp_path: Path
     assert run[-1][1]["exit_status"] == "success"
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_an_abort_keeps_what_was_measured_and_says_why(bench: Bench, tmp_path: Path, name: str) -> None:
-    import signal
+def test_a_silent_wire_holds_up_neither_the_pause_nor_the_brake(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The source's wire is dead: its stop is not acknowledged for seconds. Meanwhile nothing else may begin, nor be read."""
+    dead = threading.Event()
+    stop = bench.axes["source"].driver.stop
 
+    def unacknowledged() -> None:
+        if threading.current_thread().name.startswith("stop"):
+            dead.wait(20)
+        stop()
+
+    monkeypatch.setattr(bench.axes["source"].driver, "stop", unacknowledged)
+    paused_while_dead: list[bool] = []
+
+    def abort(interrupts: Interrupts) -> bool:
+        paused_while_dead.append(not dead.is_set() and not interrupts.halted.is_set())
+        held = [bench.axes["detector"].set(-70.0), bench.meter.trigger()]
+        assert not any(status.done for status in held)
+        dead.set()
+        interrupts.halted.wait(20)
+        return False
+
+    views = tuple(float(v) for v in range(-60, 31, 10))
+    try:
+        run = run_sweep(bench, tmp_path, Trajectory((45.0,), views), ask=True, decide=abort, watch=interrupt_at(4, signal.SIGINT))
+    finally:
+        dead.set()
+        bench.release()
+    assert paused_while_dead == [True]
+    for event in (doc["data"] for name, doc in run if name == "event"):
+        assert event["theta_r"] == pytest.approx(event["theta_r_setpoint"], abs=0.001)
+
+
+def test_what_is_held_back_begins_again_when_released(bench: Bench) -> None:
+    assert bench.halt() == []
+    move, reading = bench.axes["detector"].set(-30.0), bench.meter.trigger()
+    assert not move.done
+    assert not reading.done
+    assert bench.axes["detector"].position == pytest.approx(0.0, abs=0.02)
+    bench.release()
+    assert move.success
+    assert reading.success
+    bench.axes["detector"].set(-30.0).wait(10)
+    assert bench.axes["detector"].position == pytest.approx(-30.0, abs=0.02)
+
+
+def test_an_arm_is_not_moved_while_nobody_knows_where_the_other_is(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench.axes["source"], "_homed", False)
+    with pytest.raises(InterlockError, match="source has no reference"):
+        bench.axes["detector"].set(-30.0)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_an_abort_keeps_what_was_measured_and_says_why(bench: Bench, tmp_path: Path, name: str) -> None:
     views = tuple(float(v) for v in range(-60, 31, 10))
     run = run_sweep(bench, tmp_path, Trajectory((45.0,), views), watch=interrupt_at(4, signal.Signals[name]))
     assert 4 <= sum(kind == "event" for kind, _ in run) < 10
@@ -132,7 +181,6 @@ def test_a_fault_ends_the_run_as_failed_with_its_name(bench: Bench, tmp_path: Pa
     def knock(name: str, doc: dict) -> None:
         # An arm is stopped by hand as soon as it moves.
         if name == "event" and doc["seq_num"] == 2:
-            import threading
 
             def hand() -> None:
                 while not bench.axes["detector"].driver.state().moving:
@@ -157,5 +205,5 @@ def test_a_journal_that_cannot_be_written_ends_the_run(bench: Bench) -> None:
             if name == "event":
                 raise RunError("journal.jsonl: the journal cannot be written: No space left on device")
 
-    with Interrupts(bench.stop, ask=False) as interrupts, pytest.raises(RunError, match="No space left"):
+    with Interrupts(bench.halt, bench.release, ask=False) as interrupts, pytest.raises(RunError, match="No space left"):
         run_plan(sweep(bench, Trajectory((45.0,), (0.0, 10.0)), {"cultivar": "RR"}), interrupts, [Full()], never)
