@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers import catalogue
+from drivers.errors import DeviceError
 from drivers.incidents import Report
 from drivers.link import Link
 from drivers.models import Device
@@ -53,16 +54,20 @@ class Ports:
         port = device.port
         if port not in self._open:
             url = self._simulated.url(port) if self._simulated else port
-            link = self._models.lookup(device.model).open_link(
-                url,
-                timeout_s=LINK_TIMEOUT_S,
-                traffic=self._trace.traffic(port) if self._trace else None,
-                report=self._report,
-                **device.serial,
-            )
-            self._stack.callback(link.close)
+            try:
+                link = self._models.lookup(device.model).open_link(
+                    url,
+                    timeout_s=LINK_TIMEOUT_S,
+                    traffic=self._trace.traffic(port) if self._trace else None,
+                    report=self._report,
+                    **device.serial,
+                )
+            except DeviceError as exc:
+                exc.device = device.name  # as the user calls it
+                raise
             worker = BusWorker(port, self.clock)
             self._stack.callback(worker.close)
+            self._stack.callback(link.close)  # before the worker: it may be waiting for an answer, of a camera for a minute
             self._open[port] = (link, worker)
         return self._open[port]
 
@@ -76,6 +81,17 @@ class Ports:
         """
         link, worker = self.on(device)
         return self._models.lookup(device.model).open_device(link, name=device.name, **device.options), worker
+
+    def halt(self, axis: AxisConfig) -> None:
+        """Put the stop on an axis's wire, whatever state it is in; nothing is asked or set first.
+
+        Raises
+        ------
+        drivers.DeviceError
+            The port cannot be opened, or the stop is not acknowledged.
+        """
+        link, _ = self.on(axis)
+        self._models.lookup(axis.model).halt_device(link, name=axis.name, **axis.options)
 
 
 @contextmanager

@@ -96,9 +96,9 @@ def main(arguments: list[str] | None = None) -> None:
     except click.ClickException as exc:
         _fail(exc.format_message(), 1)
     except ConfigError as exc:
-        _fail(str(exc), 2, exc, arguments)
+        _fail(_said(exc), 2, exc, arguments)
     except (Interrupted, KeyboardInterrupt, click.Abort) as exc:
-        _fail(f"interrupted{f': {exc}' if str(exc) else ''}", 130)
+        _fail(f"interrupted{f': {_said(exc)}' if _said(exc) else ''}", 130)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
@@ -106,7 +106,12 @@ def main(arguments: list[str] | None = None) -> None:
         name = _name(exc)
         if name is None:
             raise
-        _fail(f"{name}{exc}", 1, exc, arguments)
+        _fail(f"{name}{_said(exc)}", 1, exc, arguments)
+
+
+def _said(exc: BaseException) -> str:
+    """Return an error's text with what was added on its way: that an axis could not be stopped, say."""
+    return "; ".join(filter(None, [str(exc), *getattr(exc, "__notes__", ())]))
 
 
 def _name(exc: Exception) -> str | None:
