@@ -25,6 +25,18 @@ def _driver(path: str, **fixed: Any) -> Callable[..., Device]:
     return connect
 
 
+def _halt(path: str, *place: str, **fixed: Any) -> Callable[..., None]:
+    """Make the `halt` of a model out of a driver's ``module:Class``: the bare constructor, which sends nothing, and a stop.
+
+    Of the options only those of `place`, which say where the stage is, are the constructor's business.
+    """
+
+    def halt(link: Link, name: str, **options: Any) -> None:
+        _load(path)(link, name, **fixed, **{key: options[key] for key in place}).stop()
+
+    return halt
+
+
 def _port(path: str) -> Callable[..., Link]:
     """Make the `open_port` of a model out of a link's ``module:Class``."""
 
@@ -64,20 +76,19 @@ def _zaber(name: str, description: str) -> DeviceModel:
         description=description,
         protocol="Zaber ASCII",
         connect=connect,
+        halt=_halt("drivers.stages.zaber:ZaberAxis", "address", "axis", "checksums", microsteps_per_unit=1.0),
         line=_line(115200, terminator="CRLF"),
         options={
             "address": Option(int, 1, "device address on the chain"),
             "axis": Option(int, 1, "axis of the device"),
             scale: Option(float, None, f"scale; {told}"),
-            "speed": Option(float, None, f"speed in {unit}/s; the stage's own setting when not given"),
-            "acceleration": Option(float, None, f"acceleration in {unit}/s^2; the stage's own setting when not given"),
             "acceleration_unit": Option(float, None, "microsteps/s^2 in one unit of accel; default 10000/1.6384, not verified"),
             "checksums": Option(bool, True, "send checksums and insist on them in replies"),
         },
     )
 
 
-def _newport(name: str, description: str) -> DeviceModel:
+def _newport(name: str, description: str, baudrate: int) -> DeviceModel:
     return DeviceModel(
         name=name,
         kind="rotary-axis",
@@ -85,14 +96,12 @@ def _newport(name: str, description: str) -> DeviceModel:
         description=description,
         protocol="Newport ESP over RS-232",
         connect=_driver("drivers.stages.newport:NewportAxis"),
-        # An ESP301 talks at 921600 on its USB port; not verified.
-        line=_line(19200, rtscts=True, terminator="CRLF"),
+        halt=_halt("drivers.stages.newport:NewportAxis", "axis"),
+        line=_line(baudrate, rtscts=True, terminator="CRLF"),
         options={
             "axis": Option(int, 1, "axis of the controller, 1 to 3"),
             "degrees_per_unit": Option(float, None, "scale; found from the units the axis is set to when not given"),
             "home_search": Option(int, 1, "parameter of OR: 1 home and index, 2 home, 3 to 6 limit switches; not verified"),
-            "speed": Option(float, None, "speed in deg/s; the controller's own setting when not given"),
-            "acceleration": Option(float, None, "acceleration in deg/s^2; the controller's own setting when not given"),
         },
     )
 
@@ -103,8 +112,6 @@ def _sigma_koki(name: str, controller: str, description: str) -> DeviceModel:
         "degrees_per_pulse": Option(float, None, "scale; from the division of steps when not given, 0.0025 deg where it is not told"),
         "low_deg": Option(float, -180.0, "lower end of travel in deg: the controller knows none"),
         "high_deg": Option(float, 180.0, "upper end of travel in deg"),
-        "speed": Option(float, 12.5, "speed in deg/s"),
-        "acceleration": Option(float, 60.0, "acceleration in deg/s^2"),
     }
     if controller == "GSC-02":
         options["home_direction"] = Option(str, "-", "+ or -: where to look for the origin")
@@ -115,6 +122,7 @@ def _sigma_koki(name: str, controller: str, description: str) -> DeviceModel:
         description=description,
         protocol="Sigma Koki ASCII over RS-232",
         connect=_driver("drivers.stages.sigma_koki:SigmaKokiAxis", controller=controller),
+        halt=_halt("drivers.stages.sigma_koki:SigmaKokiAxis", "axis", controller=controller),
         line=_line(9600, rtscts=True, terminator="CRLF"),
         options=options,
     )
@@ -181,8 +189,9 @@ BUILT_IN: tuple[DeviceModel, ...] = (
     # Only its existence is known: its step size is read from the stage like the other's.
     _zaber("zaber-x-rst120ak", "motorised rotary stage, 120 mm"),
     _zaber("zaber-x-lsm", "motorised linear stage"),
-    _newport("newport-esp301", "motion controller with a rotary stage"),
-    _newport("newport-esp300", "motion controller with a rotary stage"),
+    # 921600 baud is that of the ESP301's own USB port; its RS-232 port has 19200 as the ESP300's. Not verified.
+    _newport("newport-esp301", "motion controller with a rotary stage", 921600),
+    _newport("newport-esp300", "motion controller with a rotary stage", 19200),
     _sigma_koki("sigma-koki-shot-302gs", "SHOT-302GS", "stage controller with a rotary stage, such as OSMS-60YAW"),
     _sigma_koki("sigma-koki-gsc-02", "GSC-02", "stage controller with a rotary stage; it answers no command"),
     DeviceModel(
@@ -192,6 +201,7 @@ BUILT_IN: tuple[DeviceModel, ...] = (
         description="AZ driver with hollow rotary actuator (DGII)",
         protocol="Modbus RTU",
         connect=_driver("drivers.stages.oriental:OrientalAxis"),
+        halt=_halt("drivers.stages.oriental:OrientalAxis", "address"),
         open_port=_MODBUS,
         line=_line(115200, "8E1"),
         options={
@@ -199,8 +209,6 @@ BUILT_IN: tuple[DeviceModel, ...] = (
             "steps_per_degree": Option(float, 50.0, "scale; default for 1000 steps a turn and an 18:1 gear, not verified"),
             "limit_min_deg": Option(float, 0.0, "lower end of travel in deg; set the same in the driver"),
             "limit_max_deg": Option(float, 360.0, "upper end of travel in deg; set the same in the driver"),
-            "speed": Option(float, 20.0, "speed in deg/s"),
-            "acceleration": Option(float, 100.0, "acceleration in deg/s^2"),
             "home_bit": Option(int, 4, "input bit that starts homing, 0 to 15; as delivered ZHOME"),
             "home_end_holds": Option(bool, True, "whether HOME-END stays on when the axis moves on; not verified"),
         },
@@ -213,7 +221,7 @@ BUILT_IN: tuple[DeviceModel, ...] = (
         protocol="SCPI over RS-232",
         connect=_connect_keithley,
         # Baud rate and terminator are set in the meter's menu; as delivered not verified.
-        line=_line(9600, xonxoff=False, terminator="CR"),
+        line=_line(9600, xonxoff=False, terminator="LF"),
         options={
             "integration_s": Option(float, 0.1, "integration time in s, up to 1"),
             "range": Option(float, None, "full scale in A; automatic when not given"),
@@ -250,6 +258,7 @@ BUILT_IN: tuple[DeviceModel, ...] = (
         protocol="RAW files in a folder, its port is folder:PATH",
         connect=_driver("drivers.cameras.folder:FolderCamera"),
         open_port=_port("drivers.cameras.folder:FolderLink"),
+        reads_at_once=False,  # somebody may have to press the shutter
         options={
             "patch": Option(str, "markers", "markers, markers:A,B,C,D (top left, clockwise), chart:NUMBER or X,Y,WIDTH,HEIGHT"),
             "dictionary": Option(str, "DICT_4X4_50", "OpenCV's name of the markers' dictionary"),

@@ -31,11 +31,13 @@ class AxisState:
     position : float
         Readback, in the stage's unit.
     moving : bool
-        Whether the axis is busy.
+        Whether the axis is on its way. Where the controller only tells that one of its axes is, and no motion was started on this link,
+        true for each of them.
     homed : bool
-        Whether the axis has a reference position.
+        Whether the axis has a reference position, as far as its controller or, of a `ForgetfulStage`, its driver knows.
     warnings : tuple of str
-        Warning flags in the device's own spelling, all that are set.
+        What the device complains of: flags or errors in its own spelling where it has one. Some devices tell only one of several, or
+        keep them until the next motion.
     waiting : bool
         The axis has been told to move and its controller is busy with another axis; it counts as moving.
     """
@@ -197,15 +199,19 @@ class Stage(Protocol):
         ...
 
     def limits(self) -> tuple[float, float]:
-        """The device's own lower and upper limit."""
+        """Lower and upper limit: the device's own, or those configured where it tells none."""
         ...
 
     def profile(self) -> MotionProfile:
-        """Read speed and acceleration from the device."""
+        """Speed and acceleration: the device's own, or those last set where it tells none. Sends nothing that sets anything."""
         ...
 
     def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
-        """Set speed, acceleration or both in the device."""
+        """Set speed, acceleration or both in the device.
+
+        With neither given, make sure that the device has what `profile` says: called before the axis is to move. Opening a stage sets
+        nothing, for the axis may be moving then.
+        """
         ...
 
     def start_home(self) -> None:

@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
@@ -38,6 +39,34 @@ _CHUNK = 4096
 _SLICE_S = 0.05  # how soon a waiting thread notices that the link was closed under it
 _STALE_CHUNKS = 64  # a device that babbles for ever must not hold up the request
 _SKIPPED_LINES = 8  # lines nobody claimed, kept for error messages and reports
+
+
+class Witness:
+    """Tells a callback of the traffic on a port, and keeps what it raises from the port.
+
+    Parameters
+    ----------
+    traffic : callable, optional
+        See `Link`.
+    url : str
+        Of the port, for the log.
+    """
+
+    def __init__(self, traffic: Traffic | None, url: str) -> None:
+        self._traffic = traffic
+        self._url = url
+        self._failed = False
+
+    def saw(self, time_s: float, direction: Literal["tx", "rx"], data: bytes) -> None:
+        """Tell that bytes passed; the first failure is logged."""
+        if self._traffic is None:
+            return
+        try:
+            self._traffic(time_s, direction, data)
+        except Exception:
+            if not self._failed:
+                self._failed = True
+                log.exception("traffic on %s is not told", self._url)
 
 
 class _Waiting(Generic[T]):
@@ -81,8 +110,9 @@ class Link:
     terminator : bytes
         What ends each line the device sends.
     traffic : callable, optional
-        Called with (monotonic time in s, ``"tx"`` or ``"rx"``, bytes) for all that passes, as it passes, from whichever
-        thread handles it; it must be quick.
+        Called with (monotonic time in s, ``"tx"`` or ``"rx"``, bytes) for all that has passed, from whichever thread handles it; it
+        must be quick. Bytes are told once they are on their way, so an answer to one thread's urgent request may be told before the
+        request by another: the times are in order. What it raises is logged once and goes no further.
     report : callable, optional
         Called with an `Incident` whenever the link did something about trouble: sent a request again, resynchronised, dropped input.
         It is called between exchanges, never with a request on the wire of the same thread. What it raises is logged and goes no further.
@@ -110,7 +140,7 @@ class Link:
         self.terminator = terminator
         self.unasked: tuple[bytes, ...] = ()
         self._port = port
-        self._traffic = traffic
+        self._witness = Witness(traffic, url)
         self._report = report
         self._turn = threading.Lock()  # held for a whole ordinary exchange
         self._write_lock = threading.Lock()  # held only while bytes go out
@@ -250,9 +280,7 @@ class Link:
         started = time.monotonic()
 
         def once() -> T:
-            if urgent:
-                return self._send_and_wait(request, accept, allowed_s, veto, reading=False)
-            with self._turn:
+            with nullcontext() if urgent else self._turn:
                 reading = self._take_reading()
                 try:
                     if reading:
@@ -316,12 +344,14 @@ class Link:
                 raise objection
             with self._state:
                 self._waiting.append(waiting)
+            sent_s = time.monotonic()
             try:
                 self._send(request)
             except BaseException:
                 self._forget(waiting)
                 raise
         try:
+            self._witness.saw(sent_s, "tx", request)  # only now: a log that waits for its disk must not keep a stop from going out
             deadline = time.monotonic() + allowed_s
             if reading:
                 self._read_for(waiting, deadline)
@@ -346,12 +376,22 @@ class Link:
         partial = self._buffer
         raw = b"".join(line + self.terminator for line in waiting.skipped) + partial
         if partial:
-            problem = f"the reply broke off before its terminator ({self.terminator.hex(' ')})"
+            problem = self._other_end(raw) or f"the reply broke off before its terminator ({self.terminator.hex(' ')})"
         elif waiting.skipped:
             problem = "no reply to this request, only other lines"
         else:
             problem = "no reply"
         return TransportTimeout(problem, raw=raw, hint="check power, cable, address and line settings")
+
+    def _other_end(self, raw: bytes) -> str:
+        """What to say of a reply that ends a line otherwise than this link does; nothing of one that just broke off."""
+        names = {end: name for name, end in TERMINATORS.items()}
+        ended = next((end for end in sorted(names, key=len, reverse=True) if raw.endswith(end)), b"")
+        if not ended or self.terminator not in names:
+            return ""
+        perhaps = "if it always does, " if self.terminator.startswith(ended) else ""
+        told, expected = f"{names[ended]} ({ended.hex(' ')})", names[self.terminator]
+        return f'the reply ended in {told}, not {expected}: {perhaps}set terminator = "{names[ended]}"'
 
     def _take_reading(self) -> bool:
         """Become the thread that reads, unless there is one."""
@@ -432,8 +472,8 @@ class Link:
             return b""
         except OSError as error:
             raise _lost(error) from error
-        if chunk and self._traffic is not None:
-            self._traffic(time.monotonic(), "rx", chunk)
+        if chunk:
+            self._witness.saw(time.monotonic(), "rx", chunk)
         return chunk
 
     def _receive_without_descriptor(self, wait_s: float) -> bytes:
@@ -444,8 +484,6 @@ class Link:
     def _send(self, request: bytes) -> None:
         if self._closed:
             raise PortClosed("the link was closed")
-        if self._traffic is not None:
-            self._traffic(time.monotonic(), "tx", request)
         try:
             self._port.write(request)
         except OSError as error:

@@ -313,7 +313,9 @@ class ModbusLink(Link):
         return False, in_hex(dropped)
 
     def _send_frame(self, frame: bytes) -> None:
+        sent_s = time.monotonic()
         self._send(frame)
+        self._witness.saw(sent_s, "tx", frame)
         assert isinstance(self._client.framer, _ReplyFramer)
         self._silent_since = time.monotonic() + len(frame) * self._character_s
         self._give_way_at = self._silent_since + (self._client.framer.length + 3) * self._character_s + _GIVE_WAY_S

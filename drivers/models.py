@@ -75,6 +75,11 @@ class DeviceModel:
         Keyword arguments of `connect`.
     open_port : callable
         Called as `Link.open` is; other than that for what is not made of lines: Modbus, a stream, a folder.
+    halt : callable, optional
+        ``halt(link, name, **options)`` stops a stage and asks it nothing first: neither who nor how it is. So it can be told while it
+        moves, and after the program that moved it is gone. It is sent once more when unacknowledged. Without it, see `halt_device`.
+    reads_at_once : bool
+        Whether a reading comes without somebody's doing; not so where a picture must be taken.
     """
 
     name: str
@@ -86,6 +91,8 @@ class DeviceModel:
     line: Mapping[str, Any] = field(default_factory=dict)
     options: Mapping[str, Option] = field(default_factory=dict)
     open_port: Callable[..., Link] = Link.open
+    halt: Callable[..., None] | None = None
+    reads_at_once: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "line", MappingProxyType(dict(self.line)))
@@ -113,7 +120,7 @@ class DeviceModel:
         return self.open_port(url, device=self.name, timeout_s=timeout_s, traffic=traffic, report=report, **settings)
 
     def open_device(self, link: Link, *, name: str, **options: Any) -> Device:
-        """Open a device on a link, which may carry others and stays the caller's to close.
+        """Open a device on a link, which may carry others and stays the caller's to close. Nothing is set in a stage, it may be moving.
 
         Raises
         ------
@@ -122,6 +129,30 @@ class DeviceModel:
         DeviceError
             The device does not answer as it should.
         """
+        return self.connect(link, name, **self._checked(link, name, options))
+
+    def halt_device(self, link: Link, *, name: str, **options: Any) -> None:
+        """Stop a stage that nobody needs to have opened: by `halt`, or where the model has none by opening it first.
+
+        Raises
+        ------
+        InvalidSetting
+            The model has no such option, or it cannot have that value; or it is not a stage.
+        DeviceError
+            The stage has not acknowledged; it may still be moving.
+        """
+        if not self.kind.endswith("-axis"):
+            raise InvalidSetting(f"a {self.kind} cannot be stopped", device=name, port=link.url, expected="a stage")
+        values = self._checked(link, name, options)
+        if self.halt is not None:
+            self.halt(link, name, **values)
+            return
+        device = self.connect(link, name, **values)
+        assert isinstance(device, Stage)
+        device.stop()
+
+    def _checked(self, link: Link, name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+        """All options, those not given at their defaults."""
         self._refuse_unknown(options, self.options, "option")
         values = {}
         for key, option in self.options.items():
@@ -130,7 +161,7 @@ class DeviceModel:
             except InvalidSetting as error:
                 error.complete(device=name, port=link.url, attempt=f"option {key} of {self.name}")
                 raise
-        return self.connect(link, name, **values)
+        return values
 
     def _refuse_unknown(self, given: Mapping[str, Any], known: Mapping[str, Any], what: str) -> None:
         for key in given:

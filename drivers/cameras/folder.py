@@ -14,11 +14,13 @@ import fnmatch
 import math
 import os
 import shlex
+import signal
 import stat
 import subprocess
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ from drivers.cameras.frame import CHANNELS, NOT_TOLD, Frame, read_frame
 from drivers.cameras.patch import DICTIONARY, MARGIN, Statistics, finder, statistics
 from drivers.errors import DeviceError, DeviceFault, InvalidSetting, PortClosed, TransportTimeout
 from drivers.kinds import Identity, LightReading
-from drivers.link import Traffic
+from drivers.link import Traffic, Witness
 from drivers.motion import Clock
 
 SCHEME = "folder:"
@@ -61,7 +63,8 @@ class FolderLink:
     device : str
         For messages.
     traffic : callable, optional
-        Called with (monotonic time in s, ``"tx"``, command) and (monotonic time in s, ``"rx"``, name of the file taken).
+        Called with (monotonic time in s, ``"tx"``, command) and (monotonic time in s, ``"rx"``, name of the file taken). What it raises
+        is logged once and goes no further.
     """
 
     def __init__(self, url: str, *, device: str = "", timeout_s: float = 1.0, traffic: Traffic | None = None) -> None:
@@ -73,7 +76,7 @@ class FolderLink:
         self.timeout_s = timeout_s
         self.path = Path(path.removeprefix("//")).expanduser()
         self.closed = False
-        self._traffic = traffic
+        self._witness = Witness(traffic, url)
 
     @classmethod
     def open(cls, url: str, *, device: str = "", timeout_s: float = 1.0, traffic: Traffic | None = None, **_: Any) -> FolderLink:
@@ -91,6 +94,11 @@ class FolderLink:
             raise TransportTimeout("no such folder", device=device, port=url, attempt="opening the folder", hint="make it, or mount it")
         return link
 
+    def require_open(self, attempt: str) -> None:
+        """Raise PortClosed if the link was closed."""
+        if self.closed:
+            raise PortClosed("the folder was closed", device=self.device, port=self.url, attempt=attempt, hint="open it again")
+
     def look(self, attempt: str) -> dict[str, Glimpse]:
         """Return what is in the folder now.
 
@@ -99,8 +107,7 @@ class FolderLink:
         PortClosed
             The folder is gone or cannot be read, or the link was closed.
         """
-        if self.closed:
-            raise PortClosed("the folder was closed", device=self.device, port=self.url, attempt=attempt, hint="open it again")
+        self.require_open(attempt)
         found = {}
         try:
             with os.scandir(self.path) as entries:
@@ -120,11 +127,10 @@ class FolderLink:
 
     def note(self, direction: Any, data: bytes) -> None:
         """Tell the traffic log."""
-        if self._traffic is not None:
-            self._traffic(time.monotonic(), direction, data)
+        self._witness.saw(time.monotonic(), direction, data)
 
     def close(self) -> None:
-        """Let go of the folder; who waits for a file gets `PortClosed`. Closing twice is harmless."""
+        """Let go of the folder; who waits for a file or a command gets `PortClosed` within `POLL_S`. Closing twice is harmless."""
         self.closed = True
 
     def __enter__(self) -> FolderLink:
@@ -329,7 +335,16 @@ class FolderCamera:
         return self._exposure_s
 
     def identify(self) -> Identity:
-        """Say who took the last picture, as far as its file tells; before the first picture nothing is known."""
+        """Make sure that the folder is there, and say who took the last picture, as far as its file tells: before it nothing is known.
+
+        Raises
+        ------
+        PortClosed
+            The folder is gone or cannot be read.
+        """
+        attempt = "looking for the folder"
+        self._told(lambda: self._require_open(attempt))
+        self._told(lambda: self._link.look(attempt))
         return self._identity
 
     def configure(self, integration_s: float, range: float | None = None) -> None:
@@ -355,7 +370,7 @@ class FolderCamera:
         TransportTimeout
             None came, or none that was whole, or the command took too long.
         PortClosed
-            The folder is gone.
+            The folder is gone; or the link or the device was closed, which also ends the command.
         DeviceFault
             The command failed, or the exposure is shorter than `configure` asked for.
         UnusableFrame
@@ -435,18 +450,29 @@ class FolderCamera:
             return
         attempt, command = "taking a picture", shlex.join(self._command)
         self._link.note("tx", command.encode())
+        begun = time.monotonic()
         try:
-            done = subprocess.run(
-                self._command, cwd=self._link.path, stdin=subprocess.DEVNULL, capture_output=True, timeout=self._trigger_s, check=False
+            # A session of its own, so that what the command has started in turn can be ended with it.
+            process = subprocess.Popen(
+                self._command,
+                cwd=self._link.path,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
             )
-        except subprocess.TimeoutExpired as error:
-            raise TransportTimeout(f"{command} takes longer than {self._trigger_s:g} s; it was ended", attempt=attempt) from error
         except OSError as error:
             raise DeviceFault(f"{command} cannot be run: {error.strerror}", attempt=attempt, hint="check trigger_command") from error
-        if done.returncode:
-            told = (done.stderr.strip() or done.stdout.strip()).decode("utf-8", "replace").splitlines()
+        with _ended(process):
+            while (said := _said(process)) is None:
+                self._link.require_open(attempt)
+                self._require_open(attempt)
+                if time.monotonic() - begun > self._trigger_s:
+                    raise TransportTimeout(f"{command} takes longer than {self._trigger_s:g} s; it was ended", attempt=attempt)
+        if process.returncode:
+            told = said.decode("utf-8", "replace").splitlines()
             story = f": {told[-1][:200]}" if told else ""
-            raise DeviceFault(f"{command} ended with exit code {done.returncode}{story}", attempt=attempt, hint="check camera and cable")
+            raise DeviceFault(f"{command} ended with exit code {process.returncode}{story}", attempt=attempt, hint="check camera and cable")
 
     def _readings(self, frame: Frame) -> dict[str, LightReading]:
         iso = frame.iso or self._iso
@@ -455,6 +481,32 @@ class FolderCamera:
             raise DeviceFault(problem, attempt="measuring the patch", hint="give iso, as the camera is set")
         found = statistics(frame, self._find(frame))
         return {channel: judge(found, channel, frame, iso, self._tolerated) for channel in CHANNELS}
+
+
+def _said(process: subprocess.Popen[bytes]) -> bytes | None:
+    """What a command that has ended complained of, or else said; None if it still runs after a moment."""
+    try:
+        output, complaints = process.communicate(timeout=POLL_S)
+    except subprocess.TimeoutExpired:
+        return None
+    return complaints.strip() or output.strip()
+
+
+@contextmanager
+def _ended(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Leave no command behind, nor what it has started, when there is an error."""
+    try:
+        yield
+    except BaseException:
+        if os.name != "posix":
+            process.kill()
+        elif process.returncode is None:  # else its number may be another's
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        for pipe in (process.stdout, process.stderr):
+            if pipe is not None:
+                pipe.close()
+        raise
 
 
 def _words(command: str | None) -> list[str]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from drivers.agreement import agreed
 from drivers.doubt import Doubt
@@ -177,18 +177,16 @@ class LuminanceMeter:
         link: Link,
         name: str,
         *,
-        model: Model = "LS-100",
         integration_s: float = 0.4,
         calibration: str = "preset",
-        serial_number: str = "not told",
-        fast_s: float = 0.1,
-        slow_s: float = 0.4,
-        measuring_s: float = 3.0,
-        chroma_over_is_good: bool = False,
-        fixed_width: bool = True,
-        agreement: float = 0.05,
+        **options: Any,
     ) -> LuminanceMeter:
         """Make sure that a meter is there, and set calibration, absolute readings, continuous measurement and the response.
+
+        Parameters
+        ----------
+        options
+            The constructor's.
 
         Raises
         ------
@@ -197,18 +195,7 @@ class LuminanceMeter:
         DeviceFault
             The meter refuses a setting.
         """
-        meter = cls(
-            link,
-            name,
-            model=model,
-            serial_number=serial_number,
-            fast_s=fast_s,
-            slow_s=slow_s,
-            measuring_s=measuring_s,
-            chroma_over_is_good=chroma_over_is_good,
-            fixed_width=fixed_width,
-            agreement=agreement,
-        )
+        meter = cls(link, name, **options)
         if calibration not in CALIBRATIONS:
             raise InvalidSetting(f"calibration {calibration!r}", device=name, expected=" or ".join(CALIBRATIONS))
         meter._response(integration_s, None)  # refuse nonsense before anything is sent

@@ -17,7 +17,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from drivers.doubt import Doubt
 from drivers.endpoint import Endpoint, Veto
@@ -164,22 +164,24 @@ class NewportAxis:
         link: Link,
         name: str,
         *,
-        axis: int = 1,
         degrees_per_unit: float | None = None,
-        home_search: int = 1,
-        assume_homed: bool = False,
         speed: float | None = None,
         acceleration: float | None = None,
+        **options: Any,
     ) -> NewportAxis:
         """Meet the axis: read its units unless the scale is given, and set speed and acceleration if given. Nothing moves.
+
+        Parameters
+        ----------
+        options
+            The constructor's.
 
         Raises
         ------
         DeviceFault
             The axis is set to units that are no angle, or refuses a setting.
         """
-        scale = 1.0 if degrees_per_unit is None else degrees_per_unit
-        stage = cls(link, name, axis=axis, degrees_per_unit=scale, home_search=home_search, assume_homed=assume_homed)
+        stage = cls(link, name, degrees_per_unit=1.0 if degrees_per_unit is None else degrees_per_unit, **options)
         if degrees_per_unit is None:
             attempt = "reading the units"
             units = stage._wire.whole("SN?", attempt, range(12))
@@ -341,7 +343,8 @@ class NewportAxis:
     def stop(self) -> None:
         """Tell the axis to decelerate to rest, now. Returns when the controller has answered, which is before it rests.
 
-        The bytes go out at once, even while other threads wait on the link. An unanswered stop is sent once more.
+        The bytes go out at once, even while other threads wait on the link. A stop that is unanswered, or answered with an error, is
+        sent once more.
         """
         with self._stops.lock:
             self._stops.count += 1
@@ -481,10 +484,17 @@ class _Wire(Endpoint):
             )
 
     def stop(self) -> None:
-        """Send the stop, past whoever waits on the link; errors of earlier making that the answer brings are kept."""
-        error = self._doubt.urgently(lambda: self._exchange(f"{self.axis}ST;TB?", _error_or_not_ours, "stopping", _ERROR_LINE, urgent=True))
-        if error.code:
-            self.errors.append(error)
+        """Send the stop, past whoever waits on the link; errors that the answers bring are kept."""
+        message, attempt = f"{self.axis}ST;TB?", "stopping"
+
+        def error() -> EspError:
+            return self._doubt.urgently(lambda: self._exchange(message, _error_or_not_ours, attempt, _ERROR_LINE, urgent=True))
+
+        if (first := error()).code:  # of earlier making, or because the stop was damaged on the line
+            self.errors.append(first)
+            self.link.tell("repeated", f"answered with error {first}", device=self.name, attempt=attempt)
+            if (second := error()).code:
+                self.errors.append(second)
 
     def _next_error(self, attempt: str) -> EspError:
         return self._read("TB?", _error_or_not_ours, attempt, _ERROR_LINE)

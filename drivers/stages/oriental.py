@@ -318,7 +318,8 @@ class OrientalAxis:
         outputs, alarm = self._outputs(attempt)
         self._refuse_alarm(outputs, alarm, attempt)
         if not outputs & (_READY | _MOVE):
-            raise self._unit.fault("the driver is not ready", attempt, expected="READY on", hint="is the motor free, or a stop input on?")
+            hint = "is the motor free, or a stop input on? stop the axis: that lowers one which an unacknowledged stop has left on"
+            raise self._unit.fault("the driver is not ready", attempt, expected="READY on", hint=hint)
         return outputs, alarm
 
     def _refuse_alarm(self, outputs: int, alarm: int, attempt: str) -> None:

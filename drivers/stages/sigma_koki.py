@@ -9,9 +9,10 @@ A controller takes no new motion while either of its axes moves. A motion that m
 that finds the controller ready; until then the axis counts as moving.
 
 Not verified on hardware: everything. In particular the step (``degrees_per_pulse``), that a return to the origin leaves the counter at
-0, and the speeds a controller starts with, which it does not tell: opening an axis therefore sets them. The controllers know no travel
-limits (``low_deg``, ``high_deg``) nor whether an axis has been homed: the driver counts it as homed after a return to the origin that it
-has itself seen end at 0, and ``assume_homed`` says that it was homed before.
+0, and the speeds a controller starts with, which it does not tell. Nor can they be set while an axis moves: opening an axis leaves them
+alone, and `SigmaKokiAxis.set_profile` sets them before it is to move. The controllers know no travel limits (``low_deg``, ``high_deg``)
+nor whether an axis has been homed: the driver counts it as homed after a return to the origin that it has itself seen end at 0, and
+``assume_homed`` says that it was homed before.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from drivers.doubt import Doubt
 from drivers.endpoint import Endpoint, Veto
@@ -34,6 +35,9 @@ T = TypeVar("T")
 
 FULL_STEP_DEG = 0.005
 """One step of SGSP and OSMS-60YAW stages at division 1."""
+
+PROFILE = MotionProfile(speed=12.5, acceleration=60.0)
+"""What an axis is set to when nobody says otherwise, deg/s and deg/s^2."""
 
 _READINGS = 4
 _STATUS = re.compile(rb"([+ -] *\d+| *-\d+),([+ -] *\d+| *-\d+),([XK]),([KLMW]),([BR])")
@@ -114,7 +118,7 @@ DIALECTS = {dialect.model: dialect for dialect in (SHOT_302GS, GSC_02)}
 
 @dataclass(frozen=True)
 class Speeds:
-    """Start speed and speed, pulses/s, and the time of a ramp, ms, as in the ``D:`` command."""
+    """Start speed and speed, pulses/s, and the time of a ramp, ms, as in the ``D:`` command; by default as delivered, not verified."""
 
     slow: int = 500
     fast: int = 5000
@@ -144,7 +148,7 @@ class Speeds:
 class SigmaKokiAxis:
     """One axis of a controller; satisfies `drivers.kinds.Stage`. Both axes share the controller's link.
 
-    `SigmaKokiAxis.open` sets the speeds; the bare constructor sends nothing.
+    `SigmaKokiAxis.open` asks for the scale; the bare constructor sends nothing.
 
     Parameters
     ----------
@@ -203,37 +207,28 @@ class SigmaKokiAxis:
         link: Link,
         name: str,
         *,
-        controller: str = "SHOT-302GS",
-        axis: int = 1,
         degrees_per_pulse: float | None = None,
-        low_deg: float = -180.0,
-        high_deg: float = 180.0,
-        home_direction: str = "-",
-        assume_homed: bool = False,
-        speed: float = 12.5,
-        acceleration: float = 60.0,
+        speed: float | None = None,
+        acceleration: float | None = None,
+        **options: Any,
     ) -> SigmaKokiAxis:
-        """Meet the axis: read the division of its steps unless the scale is given, and set its speeds. Nothing moves.
+        """Meet the axis: read the division of its steps unless the scale is given, and set speed and acceleration if given. Nothing moves.
+
+        Parameters
+        ----------
+        options
+            The constructor's.
 
         Raises
         ------
         DeviceFault
-            The controller refuses, for instance because an axis moves.
+            The controller refuses the speeds, for instance because an axis moves.
         """
-        stage = cls(
-            link,
-            name,
-            controller=controller,
-            axis=axis,
-            degrees_per_pulse=FULL_STEP_DEG / 2 if degrees_per_pulse is None else degrees_per_pulse,
-            low_deg=low_deg,
-            high_deg=high_deg,
-            home_direction=home_direction,
-            assume_homed=assume_homed,
-        )
+        stage = cls(link, name, degrees_per_pulse=FULL_STEP_DEG / 2 if degrees_per_pulse is None else degrees_per_pulse, **options)
         if degrees_per_pulse is None and stage._dialect.answers:
             stage._scale = FULL_STEP_DEG / stage._wire.division("reading the division of steps")
-        stage.set_profile(speed, acceleration)
+        if speed is not None or acceleration is not None:
+            stage.set_profile(speed, acceleration)
         return stage
 
     @property
@@ -283,12 +278,16 @@ class SigmaKokiAxis:
         return self._travel
 
     def profile(self) -> MotionProfile:
-        """Speed and acceleration as they were last set: the controller does not tell."""
-        speeds = self._wire.controller.speeds[self._axis - 1]
+        """Speed and acceleration as they were last set on this link, else as delivered: the controller does not tell."""
+        speeds = self._wire.controller.speeds[self._axis - 1] or Speeds()
         return MotionProfile(speeds.fast * self._scale, speeds.acceleration * self._scale)
 
     def set_profile(self, speed: float | None = None, acceleration: float | None = None) -> None:
         """Set speed (deg/s), acceleration (deg/s^2) or both, to the nearest values the controller can express.
+
+        What is not given stays as it was last set on this link, and is that of `PROFILE` the first time: the controller may have been
+        left with anything. With nothing given, an axis that was set before is left alone. On a GSC-02 one command sets both axes, a first
+        time the other one as delivered.
 
         Raises
         ------
@@ -297,11 +296,12 @@ class SigmaKokiAxis:
         DeviceFault
             The controller refuses, for instance because an axis moves.
         """
-        if speed is None and acceleration is None:
-            return
         attempt = "setting speed and acceleration"
         with self._wire.lock:
-            now = self.profile()
+            known = self._wire.controller.speeds
+            if speed is None and acceleration is None and known[self._axis - 1] is not None:
+                return
+            now = self.profile() if known[self._axis - 1] else PROFILE
             speed = now.speed if speed is None else speed
             acceleration = now.acceleration if acceleration is None else acceleration
             speeds = Speeds.nearest(speed / self._scale, acceleration / self._scale, self._dialect.most_speed)
@@ -312,14 +312,14 @@ class SigmaKokiAxis:
                     attempt=attempt,
                     expected=f"speed above 0, at most {self._dialect.most_speed * self._scale:g} deg/s, and a ramp of 1 to 1000 ms",
                 )
-            both = list(self._wire.controller.speeds)
-            both[self._axis - 1] = speeds
+            one, two = (speeds, known[1]) if self._axis == 1 else (known[0], speeds)
             if self._dialect.answers:
                 command = f"D:{self._axis}{speeds}"
             else:  # one command for both axes, in one of two ranges
-                command = f"D:{2 if max(each.fast for each in both) > 200 else 1}{both[0]}{both[1]}"
+                pair = (one or Speeds(), two or Speeds())
+                command = f"D:{2 if max(each.fast for each in pair) > 200 else 1}{pair[0]}{pair[1]}"
             self._wire.act(command, attempt)
-            self._wire.controller.speeds = (both[0], both[1])
+            self._wire.controller.speeds = (one, two)
 
     def start_home(self) -> None:
         """Start the return to the mechanical origin. When it is over, `state` says ``homed``."""
@@ -359,7 +359,7 @@ class SigmaKokiAxis:
     def stop(self) -> None:
         """Tell the axis to decelerate to rest, now; forget a motion that waits. Returns when the controller has answered.
 
-        The bytes go out at once, even while other threads wait on the link. An unanswered stop is sent once more.
+        The bytes go out at once, even while other threads wait on the link. A stop that is unanswered or refused is sent once more.
         """
         with self._stops.lock:
             self._stops.count += 1
@@ -453,7 +453,7 @@ class _Controller:
     def __init__(self, link: Link) -> None:
         self.doubt = Doubt(link)
         self.moving: int | None = None  # the axis started last, while the controller is busy
-        self.speeds = (Speeds(), Speeds())
+        self.speeds: tuple[Speeds | None, Speeds | None] = (None, None)  # as this program set them
 
 
 class _Wire(Endpoint):
@@ -504,8 +504,16 @@ class _Wire(Endpoint):
     def stop(self) -> None:
         """Send the stop, past whoever waits on the link."""
         command, attempt = f"L:{self._axis}", "stopping"
-        taken = self._doubt.urgently(lambda: self._command(command, attempt, urgent=True))
-        if not taken and self._dialect.answers:
+        # ACK1 does not tell of a command that was lost, so one that is not answered goes out twice.
+        message = command if self._dialect.answers else f"{command}\r\n{command}"
+
+        def taken() -> bool:
+            return self._doubt.urgently(lambda: self._command(message, attempt, urgent=True))
+
+        if taken():
+            return
+        self.link.tell("repeated", f"{command} was refused", device=self.name, attempt=attempt)  # it may have been damaged on the line
+        if not taken() and self._dialect.answers:
             raise self.fault(f"{command} was refused", attempt, expected="OK", hint="check the controller's command mode")
 
     def _command(self, command: str, attempt: str, *, urgent: bool = False, veto: Veto | None = None) -> bool:

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from drivers.endpoint import Endpoint, Veto
 from drivers.errors import BadChecksum, DeviceFault, InvalidSetting, NotHomed, TransportTimeout, UnexpectedReply
@@ -236,16 +236,18 @@ class ZaberAxis:
         link: Link,
         name: str,
         *,
-        address: int = 1,
-        axis: int = 1,
         microsteps_per_unit: float | None = None,
         unit: Unit = "deg",
         speed: float | None = None,
         acceleration: float | None = None,
-        acceleration_unit: float = ACCELERATION_UNIT,
-        checksums: bool = True,
+        **options: Any,
     ) -> ZaberAxis:
         """Meet the stage: read its scale unless given, and set speed and acceleration if given. Nothing moves.
+
+        Parameters
+        ----------
+        options
+            The constructor's.
 
         Raises
         ------
@@ -257,34 +259,22 @@ class ZaberAxis:
         if microsteps_per_unit is None and unit == "mm":
             hint = "give microsteps_per_mm: 1000 over the microstep size in um, from the stage's data sheet"
             raise InvalidSetting("no scale", device=name, port=link.url, attempt="opening a linear stage", hint=hint)
+        stage = cls(link, name, microsteps_per_unit=1.0 if microsteps_per_unit is None else microsteps_per_unit, unit=unit, **options)
         if microsteps_per_unit is None:
-            wire = _Wire(link, name, address, axis, checksums)
             attempt = "reading the microsteps per revolution"
             try:
-                per_revolution = wire.number("limit.cycle.dist", attempt)
+                per_revolution = stage._wire.number("limit.cycle.dist", attempt)
             except DeviceFault as fault:
                 fault.hint = f"{fault.hint}; or give microsteps_per_degree in the configuration"
                 raise
             if per_revolution <= 0:
-                raise DeviceFault(
+                raise stage._wire.fault(
                     f"limit.cycle.dist is {per_revolution:g}",
-                    device=name,
-                    port=link.url,
-                    attempt=attempt,
+                    attempt,
                     expected="microsteps per revolution",
                     hint="give microsteps_per_degree in the configuration",
                 )
-            microsteps_per_unit = per_revolution / 360
-        stage = cls(
-            link,
-            name,
-            microsteps_per_unit=microsteps_per_unit,
-            unit=unit,
-            address=address,
-            axis=axis,
-            acceleration_unit=acceleration_unit,
-            checksums=checksums,
-        )
+            stage._scale = per_revolution / 360
         stage.set_profile(speed, acceleration)
         return stage
 

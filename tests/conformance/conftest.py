@@ -34,7 +34,7 @@ STAGES: dict[str, Entry] = {
     "oriental-az": ("oriental", {"address": 1}, {}),
 }
 SENSORS: dict[str, Entry] = {
-    "keithley-6485": ("meter", {}, {"terminator": "LF"}),
+    "keithley-6485": ("meter", {}, {}),
     "konica-minolta-ls-100": ("ls-100", {}, {}),
     "konica-minolta-ls-110": ("ls-100", {}, {}),
     "konica-minolta-cs-100a": ("cs-100a", {}, {}),

@@ -9,6 +9,7 @@ from drivers.motion import wait_until_idle
 
 # The simulators run faster than time: waiting is done in their time.
 from rig.clock import Clock
+from sim.faults import Fault
 from sim.serve import Running
 from tests.conformance.conftest import SPEED, STAGES, SWIFT, opened
 
@@ -174,3 +175,60 @@ def test_the_next_program_finds_the_reference_or_is_told_of_it(homed: Stage, wor
         assert next_one.state().position == pytest.approx(on(next_one, 30.0), abs=0.001)
         go(next_one, on(next_one, 40.0))
         next_one.check_arrival(on(next_one, 40.0), 0.001)
+
+
+# what another program does --------------------------------------------------------------------------------------------
+
+
+def leave_on_its_way(world: Running, model: str) -> None:
+    """Start a long and slow motion as another program does, and cut its link."""
+    with opened(world, model, STAGES[model], "mover") as mover:
+        assert isinstance(mover, Stage)
+        mover.set_profile(speed=on(mover, 2.0), acceleration=on(mover, 20.0))
+        if isinstance(mover, ForgetfulStage):
+            mover.trust_reference()
+        mover.start_move(on(mover, 300.0))
+
+
+def require_stopped(stage: Stage) -> None:
+    state = wait_until_idle(stage, 0.0, timeout_s=20, clock=CLOCK)
+    assert on(stage, 9.0) < state.position < on(stage, 295.0)
+
+
+def test_it_is_opened_asked_and_stopped_by_another_program_while_it_moves(
+    homed: Stage, world: Running, request: pytest.FixtureRequest
+) -> None:
+    model = request.node.callspec.params["stage"]
+    go(homed, on(homed, 10.0))
+    leave_on_its_way(world, model)
+    with opened(world, model, STAGES[model], "other") as other:
+        assert isinstance(other, Stage)
+        assert other.state().moving
+        assert other.identify() == homed.identify()
+        assert other.profile().speed > 0
+        assert other.limits() == homed.limits()
+        assert other.state().moving
+        other.stop()
+        require_stopped(other)
+
+
+@pytest.mark.parametrize(
+    "trouble", [None, Fault("silence", 1), Fault("silence", 2), Fault("dropped-byte", 1), Fault("garbage", 1)], ids=str
+)
+def test_it_is_halted_though_nobody_has_opened_it(
+    homed: Stage, world: Running, request: pytest.FixtureRequest, trouble: Fault | None
+) -> None:
+    """One acknowledgement may be missing or wrong, or one stop be lost."""
+    model = request.node.callspec.params["stage"]
+    instrument, options, line = STAGES[model]
+    go(homed, on(homed, 10.0))
+    leave_on_its_way(world, model)
+    found = catalogue.load().lookup(model)
+    assert found.halt is not None
+    struck = len(world.struck(instrument))
+    with found.open_link(world.url(instrument), timeout_s=0.4, **line) as link:
+        if trouble is not None:
+            world.inject(instrument, trouble)
+        found.halt_device(link, name="axis", **options)
+        assert len(world.struck(instrument)) == struck + (trouble is not None)
+    require_stopped(homed)

@@ -8,6 +8,7 @@ import struct
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -670,6 +671,58 @@ def test_a_camera_that_was_closed_takes_no_picture(camera: Any, folder: Path) ->
 def test_a_command_that_fails(camera: Any, code: str, error: type[DeviceError], told: str) -> None:
     with pytest.raises(error, match=rf"eye on folder:.*taking a picture: .*{told}"):
         camera(trigger_command=python(code), trigger_s=0.3 if error is TransportTimeout else 20.0).read()
+
+
+@pytest.mark.parametrize("closes", ["link", "device"])
+def test_closing_ends_a_command_and_what_it_started(folder: Path, desk: Desk, closes: str) -> None:
+    """At once: neither `trigger_s` nor the patience is waited for. A pipe has ended when all who could write to it have."""
+    os.mkfifo(folder / "pipe")
+    (folder.parent / "child.py").write_text("import os, signal\nos.open('pipe', os.O_WRONLY)\nsignal.pause()\n")
+    command = python("import subprocess, sys; subprocess.run([sys.executable, '../child.py'])")
+    link = FolderLink.open(f"folder:{folder}")
+    eye = FolderCamera.open(link, "eye", patch="8,8,16,12", trigger_command=command, trigger_s=600.0, patience_s=600.0, clock=desk)
+    with ThreadPoolExecutor(1) as pool:
+        reading = pool.submit(eye.read)
+        with open(folder / "pipe", "rb") as pipe:  # returns when the child is there
+            {"link": link, "device": eye}[closes].close()
+            with pytest.raises(PortClosed, match=r"eye on folder:.*taking a picture"):
+                reading.result(timeout=20)
+            assert pipe.read() == b""
+
+
+def test_closing_ends_the_waiting_for_a_picture(folder: Path, desk: Desk) -> None:
+    waits = threading.Event()
+    desk.after(1.0, waits.set)
+    with FolderLink.open(f"folder:{folder}") as link, ThreadPoolExecutor(1) as pool:
+        eye = FolderCamera.open(link, "eye", patch="8,8,16,12", patience_s=1e9, clock=desk)
+        reading = pool.submit(eye.read)
+        assert waits.wait(20)
+        link.close()
+        with pytest.raises(PortClosed, match="the folder was closed"):
+            reading.result(timeout=20)
+
+
+def test_who_it_is_is_not_told_before_a_picture_but_the_folder_must_be_there(camera: Any, folder: Path) -> None:
+    eye = camera()
+    assert eye.identify() == Identity("not told", "camera", "not told", "not told")
+    folder.rmdir()
+    with pytest.raises(PortClosed, match=r"eye on folder:.*looking for the folder: the folder is gone"):
+        eye.identify()
+    folder.mkdir()
+    eye.close()
+    with pytest.raises(PortClosed, match="the device was closed"):
+        eye.identify()
+
+
+def test_a_log_that_fails_is_no_matter(tmp_path: Path, folder: Path, desk: Desk) -> None:
+    (tmp_path / "shot.dng").write_bytes(flat(0.25))
+
+    def full(*_: Any) -> None:
+        raise OSError("No space left on device")
+
+    link = FolderLink.open(f"folder:{folder}", traffic=full)
+    command = python("import shutil; shutil.copyfile('../shot.dng', 'taken.dng')")
+    assert FolderCamera.open(link, "eye", patch="8,8,16,12", trigger_command=command, clock=desk).read().good
 
 
 def test_a_command_that_is_not_there(camera: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -151,12 +152,47 @@ def test_opening_a_meter_over_its_own_link(script: Any, make_peer: Any) -> None:
     peer = make_peer(script.serve(2 + 2 * 9 + 2 * 2, serve))
     model = catalogue.lookup("keithley-6485")
     traffic: list[Any] = []
-    with model.open_link(peer.url, timeout_s=5, traffic=lambda *entry: traffic.append(entry), terminator="LF", baudrate=19200) as link:
+    with model.open_link(peer.url, timeout_s=5, traffic=lambda *entry: traffic.append(entry), baudrate=19200) as link:
         meter = model.open_device(link, name="diode", integration_s=0.5)
         assert isinstance(meter, Keithley6485)
         assert meter.integration_s == 0.5
     assert b"SENS:CURR:NPLC 25.00" in lines
     assert traffic
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "dialogue"),
+    [
+        ("zaber-x-rsw60a", {"address": 3, "checksums": False}, (b"/3 1 00 stop\n", b"@03 1 00 OK BUSY -- 0\r\n")),
+        ("zaber-x-lsm", {"axis": 2, "checksums": False}, (b"/1 2 00 stop\n", b"@01 2 00 OK BUSY -- 0\r\n")),
+        ("newport-esp301", {"axis": 2}, (b"2ST;TB?\r", b"0, 1, NO ERROR DETECTED\r\n")),
+        ("sigma-koki-shot-302gs", {"axis": 2}, (b"L:2\r\n", b"OK\r\n")),
+        ("sigma-koki-gsc-02", {"axis": 2}, (b"L:2\r\nL:2\r\nQ:\r\n", b"         0,         0,K,K,B\r\n")),
+    ],
+)
+def test_halting_sends_the_stop_and_nothing_else(plug: Any, script: Any, model: str, options: dict[str, Any], dialogue: Any) -> None:
+    """Strict script: whatever is asked besides would fail it. No scale is needed, nor any other option that does not say where it is."""
+    catalogue.lookup(model).halt_device(plug(*script.dialogue(*dialogue)), name="theta_i", **options)
+
+
+def test_a_model_without_halt_is_opened_and_stopped(plug: Any, script: Any) -> None:
+    """As third parties write them."""
+    link = plug(*script.dialogue(b"/1 1 00 stop\n", b"@01 1 00 OK BUSY -- 0\r\n"))
+    model = DeviceModel(
+        "acme-1", "rotary-axis", "Acme", "a table", "Zaber's", connect=partial(ZaberAxis.open, microsteps_per_unit=1.0, checksums=False)
+    )
+    model.halt_device(link, name="theta_i")
+
+
+@pytest.mark.parametrize("model", [model for model in BUILT_IN if not model.kind.endswith("-axis")], ids=lambda model: model.name)
+def test_only_stages_are_halted(plug: Any, model: DeviceModel) -> None:
+    assert model.halt is None
+    with pytest.raises(InvalidSetting, match="cannot be stopped"):
+        model.halt_device(plug(), name="eye")
+
+
+def test_only_the_camera_waits_for_somebody() -> None:
+    assert [model.name for model in BUILT_IN if not model.reads_at_once] == ["camera-folder"]
 
 
 def test_opening_an_absent_port() -> None:
@@ -172,14 +208,17 @@ def test_opening_an_absent_port() -> None:
         ({"address": True}, "option address"),
         ({"address": None}, "option address"),
         ({"checksums": 1}, "option checksums"),
-        ({"speed": float("nan")}, "option speed"),
-        ({"speed": "fast"}, "option speed"),
+        ({"acceleration_unit": float("nan")}, "option acceleration_unit"),
+        ({"microsteps_per_degree": "many"}, "option microsteps_per_degree"),
+        ({"speed": 20.0}, "no option 'speed'"),
     ],
 )
 def test_nonsense_options(plug: Any, options: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(InvalidSetting) as caught:
-        catalogue.lookup("zaber-x-rsw60a").open_device(plug(), name="theta_i", **options)
-    assert complaint in str(caught.value)
+    model = catalogue.lookup("zaber-x-rsw60a")
+    for call in (model.open_device, model.halt_device):
+        with pytest.raises(InvalidSetting) as caught:
+            call(plug(), name="theta_i", **options)
+        assert complaint in str(caught.value)
 
 
 @pytest.mark.parametrize("line", [{"baud": 9600}, {"terminator": "XY"}])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import select
 import socket
@@ -295,6 +296,69 @@ def test_traffic_is_every_byte_in_order(plug: Any, script: Any) -> None:
     story = b"".join((b">" if way == "tx" else b"") + data for _, way, data in log)
     assert story == b">A?\n1\r\n>B?\n2\r\n"
     assert [at for at, _, _ in log] == sorted(at for at, _, _ in log)
+
+
+def full(*_: Any) -> None:
+    """A traffic log whose disk is full."""
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_log_that_fails_is_no_matter(plug: Any, script: Any, caplog: pytest.LogCaptureFixture) -> None:
+    link = plug(*script.dialogue(b"A?\n", b"1\r\n", b"STOP\n", b"ok\r\n"), traffic=full)
+    assert ask(link, b"A?\n") == b"1"
+    assert ask(link, b"STOP\n", urgent=True) == b"ok"
+    assert [record.message for record in caplog.records] == [f"traffic on {link.url} is not told"]
+
+
+def test_a_log_that_waits_for_its_disk_keeps_no_stop_from_the_wire(plug: Any, script: Any) -> None:
+    """The peer has the stop before the log has taken the request before it."""
+    written, stopped = threading.Event(), threading.Event()
+    waited: list[bool] = []
+
+    def slow(_: float, way: str, data: bytes) -> None:
+        if (way, data) == ("tx", b"MOVE\n"):
+            written.set()
+            waited.append(stopped.wait(5))
+
+    link = plug(
+        script.expect(b"MOVE\n"), script.expect(b"STOP\n"), script.tell(stopped), script.send(b"moved\r\nstopped\r\n"), traffic=slow
+    )
+    with ThreadPoolExecutor(1) as pool:
+        moving = pool.submit(ask, link, b"MOVE\n", only(b"moved"))
+        assert written.wait(5)
+        assert ask(link, b"STOP\n", only(b"stopped"), urgent=True) == b"stopped"
+        assert moving.result() == b"moved"
+    assert waited == [True]
+
+
+# line ends ------------------------------------------------------------------------------------------------------------
+
+ENDS = {"CR": b"\r", "LF": b"\n", "CRLF": b"\r\n", "LFCR": b"\n\r"}
+
+
+@pytest.mark.parametrize(
+    ("set_to", "sent", "complaint"),
+    [
+        ("CR", "LF", 'the reply ended in LF (0a), not CR: set terminator = "LF"'),
+        ("LF", "CR", 'the reply ended in CR (0d), not LF: set terminator = "CR"'),
+        ("CRLF", "LF", 'the reply ended in LF (0a), not CRLF: set terminator = "LF"'),
+        ("CRLF", "LFCR", 'the reply ended in LFCR (0a 0d), not CRLF: set terminator = "LFCR"'),
+        ("LFCR", "CRLF", 'the reply ended in CRLF (0d 0a), not LFCR: set terminator = "CRLF"'),
+        ("CRLF", "CR", 'the reply ended in CR (0d), not CRLF: if it always does, set terminator = "CR"'),
+    ],
+)
+def test_another_line_end_is_told_with_what_to_set(plug: Any, script: Any, set_to: str, sent: str, complaint: str) -> None:
+    link = plug(script.expect(b"?"), script.send(b"1.5" + ENDS[sent]), timeout_s=SHORT_S, terminator=ENDS[set_to])
+    with pytest.raises(TransportTimeout) as caught:
+        ask(link, b"?")
+    assert caught.value.problem == complaint
+
+
+@pytest.mark.parametrize(("set_to", "sent"), [("CR", "CRLF"), ("LF", "LFCR")])
+def test_a_line_end_of_two_where_one_was_expected_is_told(plug: Any, script: Any, set_to: str, sent: str) -> None:
+    link = plug(script.expect(b"?"), script.send(b"other" + ENDS[sent]), timeout_s=SHORT_S, terminator=ENDS[set_to])
+    with pytest.raises(TransportTimeout, match=f'not {set_to}: set terminator = "{sent}"'):
+        ask(link, b"?", only(b"mine"))
 
 
 # what is reported -----------------------------------------------------------------------------------------------------

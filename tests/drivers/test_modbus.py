@@ -284,6 +284,16 @@ def test_many_threads_on_one_link(unit: Plug, script: Any) -> None:
         assert set(pool.map(lambda _: probe.holding(0x7F, 1, "reading"), range(40))) == {(0x2030,)}
 
 
+def test_a_log_that_fails_is_no_matter(make_peer: Any, script: Any) -> None:
+    def full(*_: Any) -> None:
+        raise OSError("No space left on device")
+
+    peer = make_peer(*script.dialogue(READ_STATUS, REPLY, READ_STATUS, REPLY))
+    with ModbusLink.open(peer.url, timeout_s=20, baudrate=115200, traffic=full) as link:
+        probe = ModbusUnit(link, "probe")
+        assert [probe.holding(0x7F, 1, "reading") for _ in range(2)] == [(0x2030,)] * 2
+
+
 def test_every_byte_is_traced(make_peer: Any, script: Any) -> None:
     traffic: list[tuple[str, bytes]] = []
     late = threading.Event()

@@ -394,7 +394,9 @@ def test_an_unanswered_stop_is_sent_again(plug: Any, script: Any) -> None:
 
 
 def test_an_error_that_comes_with_the_stop_is_kept(axis: Any) -> None:
-    stage = axis(*rest(b"1.0"), b"1ST;TB?\r", b"103, 1, FOLLOWING ERROR THRESHOLD EXCEEDED\r\n", *rest(b"1.0"))
+    """And the stop sent again: the error may have been of that."""
+    error = b"103, 1, FOLLOWING ERROR THRESHOLD EXCEEDED\r\n"
+    stage = axis(*rest(b"1.0"), b"1ST;TB?\r", error, b"1ST;TB?\r", NONE, *rest(b"1.0"))
     stage.state()
     stage.stop()
     assert stage.state().warnings == ("103 FOLLOWING ERROR THRESHOLD EXCEEDED",)

@@ -333,5 +333,7 @@ def test_a_lost_origin_is_not_homed(bench: Rig) -> None:
 def test_a_stop_input_held_by_another_master(bench: Rig) -> None:
     bench.home()
     bench.simulated.write_holding(bench.now(), 0x7D, (STOP_BIT,))
-    with pytest.raises(DeviceFault, match="not ready"):
+    with pytest.raises(DeviceFault, match=r"not ready.*stop the axis"):
         bench.axis.start_move(10.0)
+    bench.axis.stop()
+    bench.axis.start_move(10.0)

@@ -13,6 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.errors import DeviceFault, InvalidSetting, NotHomed, PortClosed, TransportTimeout, UnexpectedReply
+from drivers.incidents import Incident
 from drivers.kinds import Identity, Stage
 from drivers.link import Link
 from drivers.stages.sigma_koki import SigmaKokiAxis, Speeds, Status, find_version, parse_status
@@ -111,17 +112,54 @@ def test_it_is_a_rotary_axis(plug: Any) -> None:
     assert isinstance(SigmaKokiAxis(plug(), "theta_r"), Stage)
 
 
-def test_open_reads_the_division_and_sets_the_speeds(plug: Any, script: Any) -> None:
-    link = plug(*script.dialogue(*HELLO, *says(b"?:SW", b"2,10", b"D:2S64F25000R209", b"OK")))
-    stage = SigmaKokiAxis.open(link, "theta_i", axis=2)
+def test_open_reads_the_division_and_sets_nothing(plug: Any, script: Any) -> None:
+    """The controller refuses to have its speeds set while an axis moves, and may be opened to be stopped."""
+    stage = SigmaKokiAxis.open(plug(*script.dialogue(*HELLO, *says(b"?:SW", b"2,10"))), "theta_i", axis=2)
     assert stage.degrees_per_pulse == pytest.approx(0.0005)
+    profile = stage.profile()  # as delivered: 5000 pulses/s after 200 ms, from 500
+    assert (profile.speed, profile.acceleration) == pytest.approx((2.5, 2.5 / 0.2 / 0.9))
+
+
+def test_open_sets_the_speeds_when_told_to(plug: Any, script: Any) -> None:
+    link = plug(*script.dialogue(*HELLO, *says(b"?:SW", b"2,10", b"D:2S64F10000R168", b"OK")))
+    profile = SigmaKokiAxis.open(link, "theta_i", axis=2, speed=5.0, acceleration=30.0).profile()
+    assert (profile.speed, profile.acceleration) == pytest.approx((5.0, 30.0), rel=0.005)
+
+
+def test_the_first_setting_of_a_program_sets_all_and_with_nothing_given_is_the_only_one(axis: Any) -> None:
+    """What the controller has been left with is not known."""
+    stage = axis(b"D:1S64F5000R211", b"OK", b"D:1S64F2000R86", b"OK")
+    stage.set_profile()
     profile = stage.profile()
     assert (profile.speed, profile.acceleration) == pytest.approx((12.5, 60.0), rel=0.005)
+    stage.set_profile(speed=5.0)
+    stage.set_profile()
+    assert stage.profile().speed == pytest.approx(5.0)
 
 
-def test_open_on_a_gsc_02_sets_the_speeds_of_both_axes_and_looks_whether_they_were_taken(plug: Any, script: Any) -> None:
-    link = plug(*script.dialogue(*HELLO, b"D:2S64F5000R211S500F5000R200\r\nQ:\r\n", READY + b"\r\n"))
-    SigmaKokiAxis.open(link, "theta_i", controller="GSC-02")
+def test_a_first_setting_of_the_speed_alone_sets_the_default_acceleration(axis: Any) -> None:
+    stage = axis(b"D:1S64F2000R86", b"OK")
+    stage.set_profile(speed=5.0)
+    assert stage.profile().acceleration == pytest.approx(60.0, rel=0.01)
+
+
+def test_a_setting_that_was_refused_is_not_believed(axis: Any) -> None:
+    stage = axis(b"D:1S64F5000R211", b"NG", b"D:1S64F5000R211", b"OK")
+    with pytest.raises(DeviceFault, match="still moving"):
+        stage.set_profile()
+    assert stage.profile().acceleration == pytest.approx(2.5 / 0.2 / 0.9 * 5)  # as delivered
+    stage.set_profile()
+
+
+def test_on_a_gsc_02_one_command_sets_both_axes(plug: Any, script: Any) -> None:
+    """The other one as delivered, until it is set too; and ACK1 tells whether the command was taken."""
+    answer = READY + b"\r\n"
+    link = plug(
+        *script.dialogue(*HELLO, b"D:2S64F5000R211S500F5000R200\r\nQ:\r\n", answer, b"D:2S64F5000R211S64F2000R86\r\nQ:\r\n", answer)
+    )
+    one, two = (SigmaKokiAxis.open(link, f"axis {number}", controller="GSC-02", axis=number) for number in (1, 2))
+    one.set_profile()
+    two.set_profile(speed=5.0)
 
 
 def test_identity(axis: Any) -> None:
@@ -356,9 +394,16 @@ def test_an_unanswered_stop_is_sent_again(plug: Any, script: Any) -> None:
     SigmaKokiAxis(link, "theta_r").stop()
 
 
-def test_a_refused_stop_is_an_error(plug: Any, script: Any) -> None:
+def test_a_stop_that_is_refused_is_sent_again(plug: Any, script: Any) -> None:
+    incidents: list[Incident] = []
+    link = plug(*script.dialogue(*says(b"L:1", b"NG", b"L:1", b"OK")), report=incidents.append)
+    SigmaKokiAxis(link, "theta_r").stop()
+    assert [(incident.what, incident.detail) for incident in incidents] == [("repeated", "L:1 was refused")]
+
+
+def test_a_stop_that_is_refused_twice_is_an_error(plug: Any, script: Any) -> None:
     with pytest.raises(DeviceFault, match="L:1 was refused"):
-        SigmaKokiAxis(plug(*script.dialogue(*says(b"L:1", b"NG"))), "theta_r").stop()
+        SigmaKokiAxis(plug(*script.dialogue(*says(b"L:1", b"NG", b"L:1", b"NG"))), "theta_r").stop()
 
 
 def test_arrival(axis: Any) -> None:

@@ -175,8 +175,8 @@ def test_open_reads_the_scale(plug: Any, script: Any) -> None:
         *talk(
             script,
             *("/2 1 00 get limit.cycle.dist", "@02 1 00 OK IDLE WR 1536000"),
-            *("/2 1 00 set maxspeed 139810", "@02 1 00 OK IDLE WR 0"),
-            *("/2 1 01 set accel 14", "@02 1 01 OK IDLE WR 0"),
+            *("/2 1 01 set maxspeed 139810", "@02 1 01 OK IDLE WR 0"),
+            *("/2 1 02 set accel 14", "@02 1 02 OK IDLE WR 0"),
         )
     )
     stage = ZaberAxis.open(link, "theta_i", address=2, speed=20, acceleration=20)
