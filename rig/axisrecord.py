@@ -1,11 +1,14 @@
 """What each axis was last told, on the disk, so that the next program that opens it knows."""
 
+import fcntl
 import json
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from drivers.kinds import AxisState, ForgetfulStage, Stage
 from rig.errors import RunError
@@ -13,6 +16,11 @@ from rig.files import write_atomically
 from rig.kinematics import AxisMap
 
 SCHEMA_VERSION = 1
+
+PATIENCE_S = 2.0
+"""How long another program may take to write."""
+
+LOOK_S = 0.002
 
 
 @dataclass(frozen=True)
@@ -78,21 +86,46 @@ class AxisRecords:
         Raises
         ------
         RunError
-            It cannot be written. Nothing should move then.
+            It cannot be written. Before a motion: it should not begin then.
         """
         record = AxisRecord(setpoint, readback, under_way, homed, time.time())
         with self._lock:
-            records = {**self._read(), identity: record}
-            document = {"schema_version": SCHEMA_VERSION, "axes": {key: asdict(each) for key, each in records.items()}}
             try:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(self._path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+                with self._alone():
+                    records = {**self._read(), identity: record}
+                    document = {"schema_version": SCHEMA_VERSION, "axes": {key: asdict(each) for key, each in records.items()}}
+                    write_atomically(self._path, json.dumps(document, indent=1, allow_nan=False) + "\n")
             except OSError as exc:
-                raise RunError(f"{self._path}: cannot be written: {exc.strerror or exc}; nothing was moved") from exc
+                lost = "no motion begins without it" if under_way else "where the axis stands now is not on record"
+                raise RunError(f"{self._path}: cannot be written: {exc.strerror or exc}; {lost}") from exc
+
+    def fields(self) -> dict[str, dict[str, Any]]:
+        """Return all records as they are written; none where the file cannot be read."""
+        with self._lock:
+            try:
+                return {key: asdict(record) for key, record in self._read().items()}
+            except RunError:
+                return {}
 
     def of(self, identity: str) -> "AxisMemory":
         """Return the part that is about one stage."""
         return AxisMemory(self, identity)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Keep programs that move other axes of this workspace from writing between our reading and our writing."""
+        with self._path.with_name(f".{self._path.name}.lock").open("a") as file:
+            deadline = time.monotonic() + PATIENCE_S
+            while True:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError:
+                    if time.monotonic() > deadline:
+                        raise OSError(f"another program has been writing it for {PATIENCE_S:g} s") from None
+                    time.sleep(LOOK_S)
+            yield
 
     def _read(self) -> Mapping[str, AxisRecord]:
         try:
@@ -100,7 +133,9 @@ class AxisRecords:
             return {key: AxisRecord(**fields) for key, fields in document["axes"].items()}
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as exc:
+        except OSError as exc:
+            raise RunError(f"{self._path}: cannot be read: {exc.strerror or exc}") from exc
+        except (ValueError, KeyError, TypeError, AttributeError) as exc:
             hint = "look where the arms stand, delete the file, and home the axes"
             raise RunError(f"{self._path}: not the record of the axes' last commands: {exc}; {hint}") from exc
 

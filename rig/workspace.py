@@ -49,11 +49,6 @@ class Workspace:
         return self.root / "axes.json"
 
     @property
-    def lock(self) -> Path:
-        """Held by the program that has the bench."""
-        return self.root / "bench.lock"
-
-    @property
     def cultivars(self) -> Path:
         """The lab's own cultivars."""
         return self.root / "cultivars.toml"

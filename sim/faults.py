@@ -5,7 +5,8 @@ message is a whole request, or what the instrument sends in one go, an answer or
 on the line at that moment, on nothing else.
 
 towards the instrument or from it
-    silence (the message is lost), dropped-byte, doubled-byte, unplugged
+    silence (the message is lost), dropped-byte, doubled-byte, unplugged, frozen (the message is lost, and all that follows either way for
+    2 to 6 s of real time; the line itself stays up)
 from the instrument
     delay (0.2 to 3 s of real time, and whatever follows waits behind it; the instrument itself is not held up), garbage (noise before,
     inside or instead), cut-short, stale-reply (an earlier answer in front or instead), and, where the protocol has them, wrong-checksum
@@ -41,7 +42,7 @@ from sim.zaber import ZaberChain, checksum
 TOWARDS, FROM = "tx", "rx"
 """The two ways of a line, as in traces: towards the instrument, and from it."""
 
-_BOTH_WAYS = ("silence", "dropped-byte", "doubled-byte", "unplugged")
+_BOTH_WAYS = ("silence", "dropped-byte", "doubled-byte", "unplugged", "frozen")
 _PROTOCOL = ("wrong-checksum", "wrong-address")
 KINDS = (
     "silence",
@@ -53,11 +54,13 @@ KINDS = (
     *_PROTOCOL,
     "stale-reply",
     "unplugged",
+    "frozen",
     *TROUBLES,
 )
 
 _LATE = (0.2, 3.0)
 _UNPLUGGED = (0.1, 1.0)
+_FROZEN = (2.0, 6.0)
 _MOST_NOISE = 16
 _REMEMBERED = 8
 _LONGEST_REQUEST = 4096
@@ -294,6 +297,7 @@ class Faulty:
         self._changing = threading.Lock()
         self._lines: set[_FaultyLine] = set()
         self._plugged_in = 0.0  # time.monotonic() from which on the plug is in
+        self._thawed = 0.0  # time.monotonic() from which on bytes pass
 
     def inject(self, fault: Fault) -> None:
         """Have a fault strike; from any thread.
@@ -335,6 +339,10 @@ class Faulty:
         """Tell whether the plug is out."""
         return time.monotonic() < self._plugged_in
 
+    def dead(self) -> bool:
+        """Tell whether nothing passes, either way."""
+        return time.monotonic() < max(self._plugged_in, self._thawed)
+
     def busy(self) -> bool:
         """Tell whether any fault is pending."""
         return bool(self._pending)
@@ -370,6 +378,12 @@ class Faulty:
             seconds = float(rng.uniform(*_UNPLUGGED))
             self._unplug(seconds)
             harm = b"", f"unplugged for {seconds:.3f} s"
+        elif kind == "frozen":
+            seconds = float(rng.uniform(*_FROZEN))
+            self._thawed = time.monotonic() + seconds
+            for other in self._lines:
+                other.lose()
+            harm = b"", f"frozen for {seconds:.3f} s"
         else:
             harm = _harmed(kind, message, rng, tuple(line.earlier), self._frames)
         if harm is None:
@@ -405,12 +419,16 @@ class _FaultyLine:
             self._release.cancel()
         self.hung_up.cancel()
 
-    def unplug(self) -> None:
-        """Lose what is on its way, and the client where that can be."""
+    def lose(self) -> None:
+        """Lose what is on its way."""
         self._requests.clear()
         self._held = b""
         if self._late is not None:
             self._late = []
+
+    def unplug(self) -> None:
+        """Lose what is on its way, and the client where that can be."""
+        self.lose()
         if self.hangs_up and not self.hung_up.done():
             self.hung_up.set_result(None)
 
@@ -438,7 +456,7 @@ class _FaultyLine:
                 self._left = True
                 rest, self._held = self._held, b""
                 return rest
-            if owner.unplugged():
+            if owner.dead():
                 continue
             if not owner.busy() and not self._held:
                 return data
@@ -450,7 +468,7 @@ class _FaultyLine:
 
     def write(self, data: bytes) -> None:
         owner = self._owner
-        if owner.unplugged():
+        if owner.dead():
             return
         sent = owner.passing(self, data, FROM) if data and owner.busy() else data
         self.earlier.append(data)

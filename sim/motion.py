@@ -186,6 +186,12 @@ class Track:
         """When the latest motion ends or ended, s; infinite for an endless one."""
         return self._moves[-1].profile.end
 
+    @property
+    def departures(self) -> tuple[float, ...]:
+        """When motions that are remembered began from rest, s; what takes over from another one, a stop say, does not count."""
+        profiles = [move.profile for move in self._moves]
+        return tuple(profile.start for profile in profiles if profile.velocity == 0 and profile.duration > 0)
+
     def nominal(self, t: float) -> tuple[float, float]:
         """Return the position and velocity of the profile at time `t`.
 

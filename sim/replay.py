@@ -2,16 +2,18 @@
 
 A trace file holds JSON lines. The first is about the recording, `{"trace": 1, "started": "2024-05-01T12:00:00+00:00"}`; each of the
 others is about bytes, `{"t": 0.1, "port": "sim:stages", "way": "tx", "hex": "2f310a"}`: seconds since the start, the port's name, `tx`
-towards the instrument or `rx` from it. One tx line is one whole write of the client.
+towards the instrument or `rx` from it. One tx line is one whole write of the client. Lines need not stand in the order of their times; the
+times say what came first.
 
-Times are not replayed: what was received after a request is sent at once.
+Times are not replayed: what was received after a request is sent at once. A port at which nothing was recorded can be served too, and then
+all that is said there diverges.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -179,6 +181,8 @@ class Replay:
     trace : Trace
     port : str
         One of the trace's.
+    silent : bool
+        Nothing was recorded at this port, and nothing is answered.
 
     Attributes
     ----------
@@ -192,14 +196,14 @@ class Replay:
 
     model = "replay"
 
-    def __init__(self, trace: Trace, port: str) -> None:
-        if port not in trace.ports:
+    def __init__(self, trace: Trace, port: str, *, silent: bool = False) -> None:
+        if port not in trace.ports and not silent:
             raise SimError(f"trace {trace.path}: no port {port!r}; it has {', '.join(trace.ports) or 'none'}")
         self.name = port
         self.divergences: list[Divergence] = []
         self._greeting = b""
         self._left: list[_Exchange] = []
-        for event in trace.events:
+        for event in sorted(trace.events, key=lambda event: event.t):
             if event.port != port or not event.data:
                 continue
             if event.way == "tx":
@@ -261,8 +265,9 @@ async def replaying(trace: Trace, replays: Sequence[Replay] | None = None) -> As
         yield {"replayed": str(trace.path), "started": trace.started.isoformat(), "devices": devices}
 
 
-def _replays(trace: Trace) -> tuple[Replay, ...]:
-    return tuple(Replay(trace, port) for port in trace.ports)
+def _replays(trace: Trace, silent: Iterable[str] = ()) -> tuple[Replay, ...]:
+    others = [port for port in dict.fromkeys(silent) if port not in trace.ports]
+    return (*(Replay(trace, port) for port in trace.ports), *(Replay(trace, port, silent=True) for port in others))
 
 
 @dataclass(frozen=True)
@@ -288,8 +293,8 @@ class Replayed:
 
 
 @contextmanager
-def in_background(trace: Trace) -> Iterator[Replayed]:
-    """Serve all ports of a trace from a thread of its own for the length of a `with` block."""
-    replays = _replays(trace)
+def in_background(trace: Trace, silent: Iterable[str] = ()) -> Iterator[Replayed]:
+    """Serve all ports of a trace from a thread of its own for the length of a `with` block, and `silent` ones of these names."""
+    replays = _replays(trace, silent)
     with beside(replaying(trace, replays), "replay") as report:
         yield Replayed(report, replays)

@@ -174,11 +174,14 @@ class _PtyLine:
         while True:
             await asyncio.sleep(0)  # a client that never pauses must not keep the others from being heard
             try:
-                return os.read(self._master, 4096)
+                data = os.read(self._master, 4096)
             except BlockingIOError:
                 await self._readable()
             except OSError:  # EIO: nobody has the other side open
                 return b""
+            else:
+                _unsettle(self._master)  # now, too: the next client may come before it is seen that this one has gone
+                return data
 
     async def _readable(self) -> None:
         ready: asyncio.Future[None] = self._loop.create_future()
@@ -217,8 +220,29 @@ def _tell(ready: asyncio.Future[None]) -> None:
         ready.set_result(None)
 
 
+def _unsettle(terminal: int) -> None:
+    """Give a terminal a speed that nobody asks for, so that whatever settings come next change something.
+
+    A pseudo-terminal has neither parity nor 7 bits. Asked for them, Linux leaves them out and does what else there is to do, but refuses
+    (EINVAL) where nothing is left: when the terminal is opened again with the same settings.
+    """
+    import termios
+
+    with contextlib.suppress(termios.error):  # gone
+        settings = termios.tcgetattr(terminal)
+        if settings[4:6] != [termios.B134, termios.B134]:
+            settings[4:6] = [termios.B134, termios.B134]
+            termios.tcsetattr(terminal, termios.TCSANOW, settings)
+
+
 class PtyPort:
-    """An instrument on a pseudo-terminal; one client at a time, as on a serial port."""
+    """An instrument on a pseudo-terminal; one client at a time, as on a serial port.
+
+    It takes any line settings, and goes by none: neither speed nor parity nor bits are looked at, and all eight bits pass. What stays
+    impossible: a client that has the terminal open and changes nothing but the parity or the number of bits is refused (EINVAL), unless
+    the instrument has heard from it since its last change. Give them together with the speed, when opening. There are no modem lines
+    (DTR, RTS: ENOTTY), and what is read back of the settings is not what was set.
+    """
 
     # Linux tells nobody when a terminal is opened, so it is looked at this often, in real time.
     _LOOK = 0.01
@@ -235,6 +259,7 @@ class PtyPort:
 
         self._master, slave = os.openpty()
         tty.setraw(slave)
+        _unsettle(slave)
         self.path = os.ttyname(slave)
         # Kept open here, the terminal would never tell when the client has gone; its settings outlive the closing.
         os.close(slave)
@@ -246,6 +271,7 @@ class PtyPort:
         hung_up.register(self._master, 0)
         while True:
             while any(event & select.POLLHUP for _, event in hung_up.poll(0)):
+                _unsettle(self._master)  # one who said nothing may have been gone before anybody saw
                 await asyncio.sleep(self._LOOK)
             line = _PtyLine(self._master)
             try:
@@ -256,10 +282,11 @@ class PtyPort:
             await asyncio.sleep(0)
 
     def _forget(self) -> None:
-        """Drop replies the last client did not stay to read, lest the next one takes them for its own."""
+        """Drop replies the last client did not stay to read, lest the next one takes them for its own; let it choose its settings."""
         with contextlib.suppress(OSError):  # taken by a client that wants it for itself
             slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
             try:
+                _unsettle(slave)
                 # Read, not flushed: a flush leaves what the kernel has not yet brought to the terminal.
                 while os.read(slave, 65536):
                     pass

@@ -55,11 +55,11 @@ LINES: Mapping[str, str] = MappingProxyType(
     {
         "stages": "115200 8N1, LF; replies CRLF",
         "linear": "115200 8N1, LF; replies CRLF",
-        "newport": "921600 8N1 (an ESP300: 19200 8N1 RTS/CTS), CR; replies CRLF",
+        "newport": "921600 8N1 RTS/CTS (an ESP300: 19200), CR; replies CRLF",
         "shot": "9600 8N1 RTS/CTS, CRLF",
         "gsc": "9600 8N1 RTS/CTS, CRLF",
         "oriental": "115200 8E1, Modbus RTU",
-        "meter": "9600 8N1, CR; replies {terminator}",
+        "meter": "9600 8N1, {terminator} both ways",
         "ls-100": "4800 7E2, CRLF",
         "cs-100a": "4800 7E2, CRLF",
         "apogee": "19200 8E1, Modbus RTU",
@@ -67,7 +67,8 @@ LINES: Mapping[str, str] = MappingProxyType(
         "optoncdt": "921600 8N1, CRLF",
     }
 )
-"""Line settings of the real instruments as delivered; sockets and pseudo-terminals ignore all but the line ends."""
+"""Line settings as the drivers have them where rig.toml says nothing; of newport and meter they are not verified. Sockets and
+pseudo-terminals ignore all but the line ends."""
 
 CAMERA = "camera"
 STANDING = {"source": 45.0, "detector": 0.0}

@@ -77,7 +77,9 @@ def show(model: str, as_json: bool) -> None:
 @trace_option
 @click.pass_obj
 def probe(settings: Settings, as_json: bool, trace: str | None) -> None:
-    """Ask every instrument in rig.toml who it is and how it is. Nothing moves; meters are set up as they are for reading.
+    """Ask every instrument in rig.toml who it is and how it is. Nothing moves; meters are set up as for a sweep, and read once.
+
+    The position of a stage is its own, as it counts; `rig status` says where that is on the bench.
 
     What does not answer is a line of the answer; the exit code is then 1.
     """
@@ -102,7 +104,19 @@ def _line(row: dict[str, Any]) -> str:
         return f"{head}: {row['error']}"
     identity = row["identity"]
     who = f"{identity['vendor']} {identity['model']}, serial number {identity['serial_number']}, firmware {identity['firmware']}"
-    return f"{head}: {who}; {', '.join(_said(key, value) for key, value in row['state'].items())}"
+    return f"{head}: {who}; {_state(row['state'])}"
+
+
+def _state(state: dict[str, Any]) -> str:
+    from rig.cli.instruments import shown
+
+    parts = []
+    if "own_position" in state:
+        parts.append(f"own position {state['own_position']:g} {state['unit']}")
+    elif "value" in state:
+        parts.append(f"reads {shown(state)}")
+    passed_over = {"own_position", "unit", "value", "good", "status", "flags"}
+    return ", ".join([*parts, *(_said(key, value) for key, value in state.items() if key not in passed_over)])
 
 
 def _said(key: str, value: Any) -> str:

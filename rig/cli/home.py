@@ -31,7 +31,8 @@ def command(settings: Settings, axes: tuple[str, ...], again: bool, as_json: boo
             done = again or not axis.homed
             if done:
                 follow(interrupts, axis, axis.home(), f"{mark(config)}homing {name}")
-            rows.append({"axis": name, "homed": axis.homed, "position": axis.position, "unit": axis.unit, "moved": done})
+            row = {"axis": name, "homed": axis.homed, "position": axis.position, "unit": axis.unit, "moved": done}
+            rows.append({**row, "simulated": config.simulated})
             if not as_json:
                 how = "homed" if done else "had its reference"
                 click.echo(f"{mark(config)}{name} {how}, at {axis.position:.3f} {axis.unit}")

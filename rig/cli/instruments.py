@@ -1,8 +1,9 @@
 """What the commands that talk to instruments have in common."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import click
 
@@ -32,12 +33,12 @@ def session(
 ) -> Iterator[tuple[Bench, Interrupts]]:
     """Open instruments for a command; a signal stops all axes at once. What was done about trouble is said at the end."""
     log = IncidentLog()
-    with paperwork(config, settings.workspace, trace=trace, report=log, moves=bool(axes)) as papers:
+    with paperwork(config, settings.workspace, devices=[*axes, *sensors], trace=trace, report=log) as papers:
         try:
             with open_bench(config, SPECIMEN, axes=axes, sensors=sensors, paperwork=papers) as bench:
                 for notice in bench.notices:
                     click.echo(f"note: {notice}", err=True)
-                with Interrupts(bench.stop, ask=False) as interrupts:
+                with Interrupts(bench.halt, bench.release, ask=False) as interrupts:
                     yield bench, interrupts
         finally:
             _tell(log)
@@ -45,9 +46,12 @@ def session(
 
 @contextmanager
 def looking(settings: Settings, config: BenchConfig, *, trace: str | None) -> Iterator[Paperwork]:
-    """Prepare a command that asks instruments one by one and moves nothing. What was done about trouble is said at the end."""
+    """Prepare a command that asks instruments one by one and moves nothing: it has each port only while it asks there.
+
+    What was done about trouble is said at the end.
+    """
     log = IncidentLog()
-    with paperwork(config, settings.workspace, trace=trace, report=log, moves=False) as papers:
+    with paperwork(config, settings.workspace, devices=(), trace=trace, report=log) as papers:
         try:
             yield papers
         finally:
@@ -79,6 +83,13 @@ def follow(interrupts: Interrupts, axis: Axis, motion: Status, what: str) -> Non
 def mark(config: BenchConfig) -> str:
     """Return what every line about simulated instruments begins with."""
     return "SIMULATED: " if config.simulated else ""
+
+
+def shown(row: Mapping[str, Any]) -> str:
+    """Return a reading (`reading_row`) as people read it."""
+    from rig.units import engineering
+
+    return engineering(row["value"], row["unit"]) if row["good"] else f"not good ({', '.join(row['flags'])})"
 
 
 def opened_config(settings: Settings) -> BenchConfig:

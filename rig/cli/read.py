@@ -1,8 +1,6 @@
 """`rig read`."""
 
 import json
-import math
-from typing import Any
 
 import click
 
@@ -20,8 +18,8 @@ def command(settings: Settings, sensors: tuple[str, ...], count: int, as_json: b
 
     A reading out of range, or one that the sensor does not vouch for, is marked and has no value.
     """
-    from rig.cli.instruments import chosen, mark, opened_config, session
-    from rig.units import engineering
+    from rig.cli.instruments import chosen, mark, opened_config, session, shown
+    from rig.probing import reading_row
 
     config = opened_config(settings)
     names = chosen(config, sensors, list(config.sensors), "sensor")
@@ -30,23 +28,5 @@ def command(settings: Settings, sensors: tuple[str, ...], count: int, as_json: b
             for name in names:
                 sensor = bench.sensors[name]
                 interrupts.wait(sensor.trigger())
-                row = _row(name, sensor)
-                if as_json:
-                    click.echo(json.dumps(row))
-                else:
-                    value = engineering(row["value"], sensor.unit) if row["good"] else f"not good ({', '.join(row['flags'])})"
-                    click.echo(f"{mark(config)}{name} {value}")
-
-
-def _row(name: str, sensor: Any) -> dict[str, Any]:
-    reading = sensor.last
-    value = sensor.value
-    flags = [flag for flag in ("over_range", "under_range", "out_of_range", "doubtful") if getattr(reading, flag, False)]
-    return {
-        "sensor": name,
-        "value": value if reading.good and math.isfinite(value) else None,
-        "unit": sensor.unit,
-        "good": reading.good,
-        "status": reading.status,
-        "flags": [*flags, *reading.flags],
-    }
+                row = {"sensor": name, "simulated": config.simulated, **reading_row(sensor.last, sensor.unit)}
+                click.echo(json.dumps(row) if as_json else f"{mark(config)}{name} {shown(row)}")

@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from rig.cli.settings import Settings
 from rig.errors import ConfigError
 
 NAMES = {"source": "stages", "detector": "stages", "sensor": "meter"}
@@ -52,7 +53,12 @@ def serve(
     toml: str | None,
     no_pty: bool,
 ) -> None:
-    """Start all simulated instruments, or those named, and say where each listens, until Ctrl-C or SIGTERM."""
+    """Start all simulated instruments, or those named, and say where each listens, until Ctrl-C or SIGTERM.
+
+    Each has a socket and a pseudo-terminal. A pseudo-terminal takes any speed, parity and number of bits when it is opened, again and
+    again, and ignores them. It cannot be asked for another parity or number of bits alone once it is open (EINVAL: give them together with
+    the speed, when opening), nor opened again within a hundredth of a second by a client that said nothing, and has no modem lines.
+    """
     from sim.errors import SimError
     from sim.faults import KINDS
     from sim.serve import INSTRUMENTS, Settings, build, serving
@@ -86,22 +92,40 @@ def serve(
         raise ConfigError(str(exc)) from exc
 
 
-@command.command("replay", epilog="\b\nExample:\n  rig sim replay wires.jsonl --json")
+@command.command(
+    "replay",
+    epilog="""\b
+Examples:
+  rig sim replay wires.jsonl --json
+  rig --workspace again sim replay wires.jsonl --toml again.toml
+      and in another window what was recorded: rig --workspace again --config again.toml home""",
+)
 @click.argument("trace", metavar="FILE")
 @click.option("--json", "as_json", is_flag=True, help="For programs: one line of JSON once all ports are open.")
-def replay(trace: str, as_json: bool) -> None:
+@click.option(
+    "--toml", metavar="FILE", help="Write a rig.toml with the ports of the replay, and what was known of the axes into the workspace."
+)
+@click.pass_obj
+def replay(settings: Settings, trace: str, as_json: bool, toml: str | None) -> None:
     """Stand in for the instruments of a trace (`--trace FILE` wrote it): who asks what was asked hears what was answered.
 
     At the end it says what was asked that is not in the trace.
     """
+    from rig.replays import recorded_config, write_bench
     from sim.errors import SimError
     from sim.replay import in_background, load
 
+    if toml is not None and Path(toml).exists():
+        raise ConfigError(f"--toml {toml}: is there already")
     try:
         loaded = load(trace)
     except SimError as exc:
         raise ConfigError(str(exc)) from exc
-    with in_background(loaded) as replayed:
+    config = None if toml is None else recorded_config(loaded.about, trace)
+    others = () if config is None else tuple(device.port for device in config.devices.values())
+    with in_background(loaded, silent=others) as replayed:
+        if toml is not None and config is not None:
+            write_bench(Path(toml), config, loaded.about, replayed.url, settings.workspace)
         _announce(replayed.report, as_json)
         for port, divergences in replayed.divergences.items():
             for divergence in divergences:

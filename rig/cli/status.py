@@ -2,6 +2,7 @@
 
 import json
 import sys
+from typing import Any
 
 import click
 
@@ -16,7 +17,8 @@ from rig.cli.settings import Settings, trace_option
 def command(settings: Settings, axes: tuple[str, ...], as_json: bool, trace: str | None) -> None:
     """Say where each AXIS stands, whether it has its reference, and what it was last told. Nothing moves, nothing is set.
 
-    An axis that does not answer is a line of the answer; the exit code is then 1.
+    An axis that does not answer is a line of the answer; the exit code is then 1. One that another rig command is using is not asked: what
+    is known of it is said.
     """
     from rig.cli.instruments import chosen, looking, mark, opened_config
     from rig.probing import axis_rows
@@ -36,9 +38,12 @@ def command(settings: Settings, axes: tuple[str, ...], as_json: bool, trace: str
         sys.exit(1)
 
 
-def _line(row: dict[str, object]) -> str:
+def _line(row: dict[str, Any]) -> str:
     if row["error"]:
         return f"{row['name']}: {row['error']}"
+    if row["in_use_by"]:
+        told = f", {row['last_command']}" if row["last_command"] else ""
+        return f"{row['name']}: in use by {_who(row['in_use_by'])}{told}"
     parts = [
         f"{row['name']}: {row['position']:.3f} {row['unit']}",
         "moving" if row["moving"] else "at rest",
@@ -46,7 +51,11 @@ def _line(row: dict[str, object]) -> str:
         f"limits {row['low']:g} to {row['high']:g}",
     ]
     if row["warnings"]:
-        parts.append(f"says {' '.join(map(str, row['warnings']))}")  # type: ignore[call-overload]
+        parts.append(f"says {' '.join(row['warnings'])}")
     if row["last_command"]:
         parts.append(str(row["last_command"]))
     return ", ".join(parts)
+
+
+def _who(owner: dict[str, Any]) -> str:
+    return f"process {owner['pid']} ({owner['command']})" if owner["pid"] else "another program"

@@ -1,5 +1,5 @@
-"""Two thousand sweeps on benches of mixed make, one seeded fault each: does anything hang, is a wrong reading taken for good, does an arm
-leave its limits?
+"""Two thousand sweeps on benches of mixed make, and readings along a linear axis, one seeded fault each, some interrupted: does anything
+hang, is a wrong reading taken for good, does an arm leave its limits, does anything begin after the interrupt?
 """
 
 import multiprocessing
@@ -29,6 +29,7 @@ def main() -> int:
         verdict("trials that hung", wrong["hang"], 0)
         + verdict("wrong readings stored as good", wrong["stored"], 0)
         + verdict("arms outside their limits", wrong["limits"], 0)
+        + verdict("motions begun after an interrupt", wrong["interrupt"], 0)
         + verdict("ended with no error of ours, or an arm still moving", wrong["other"], 0)
     )
 
@@ -51,11 +52,14 @@ def campaign(strikes: int, workers: int = WORKERS) -> Iterator[Outcome]:
 
 
 def table(outcomes: list[Outcome]) -> str:
-    """Return a table of kinds against what became of the sweeps."""
+    """Return a table of kinds of faults, and of what was being done, against what became of it."""
     heads = ("struck", "all good", "flagged", "named error", "wrong", "done about it")
-    lines = [f"   {'fault':<16}" + "".join(f"{head:>13}" for head in heads[:-1]) + f"  {heads[-1]}"]
-    for kind in (*kinds(), "all"):
-        own = [outcome for outcome in outcomes if kind in (outcome.kind, "all")]
+    lines = [f"   {'fault':<18}" + "".join(f"{head:>13}" for head in heads[:-1]) + f"  {heads[-1]}"]
+    for row in (*kinds(), "", *sorted({outcome.work for outcome in outcomes}), "all"):
+        own = [outcome for outcome in outcomes if row in (outcome.kind, outcome.work, "all")]
+        if not row:
+            lines.append("")
+            continue
         complete = [outcome for outcome in own if outcome.ended == "complete" and not outcome.wrong]
         flagged = sum(outcome.flagged > 0 for outcome in complete)
         wrong = sum(bool(outcome.wrong) for outcome in own)
@@ -63,12 +67,12 @@ def table(outcomes: list[Outcome]) -> str:
         numbers = (len(own), len(complete) - flagged, flagged, sum(errors.values()), wrong)
         acts = Counter(what for outcome in own for what in set(outcome.dealt_with))
         about = ", ".join(f"{name} {number}" for name, number in [*errors.most_common(3), *acts.most_common(3)])
-        lines.append(f"   {kind:<16}" + "".join(f"{number:>13}" for number in numbers) + f"  {about}")
+        lines.append(f"   {row:<18}" + "".join(f"{number:>13}" for number in numbers) + f"  {about}")
     return "\n".join(lines)
 
 
 def _what(text: str) -> str:
-    for part, name in (("hang", "hang"), ("stored", "stored"), ("beyond", "limits")):
+    for part, name in (("hang", "hang"), ("stored", "stored"), ("beyond", "limits"), ("after the interrupt", "interrupt")):
         if part in text:
             return name
     return "other"

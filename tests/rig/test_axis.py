@@ -409,7 +409,7 @@ def test_what_cannot_be_written_down_is_not_done(desk: Desk, motion: Motion, mon
     stage = at(10.0)
     axis = desk.axis(stage)
     monkeypatch.setattr("rig.axisrecord.write_atomically", full)
-    with pytest.raises(RunError, match="No space left on device; nothing was moved"):
+    with pytest.raises(RunError, match="No space left on device; no motion begins without it"):
         motion.begin(axis).wait(10)
     assert stage.told == []
 

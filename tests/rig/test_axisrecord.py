@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import subprocess
 import sys
@@ -42,7 +43,7 @@ def test_the_last_one_counts_and_the_others_stay(path: Path) -> None:
     records.put("one", setpoint=3.0, readback=1.0, under_way=True, homed=True)
     found = {name: record.setpoint for name in ("one", "two") if (record := records.get(name))}
     assert found == {"one": 3.0, "two": 2.0}
-    assert [child.name for child in path.parent.iterdir()] == ["axes.json"]
+    assert sorted(child.name for child in path.parent.iterdir()) == [".axes.json.lock", "axes.json"]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"axes": 1}', '{"axes": {"one": {"setpoint": 1.0}}}', '{"schema_version": 1}'])
@@ -110,6 +111,57 @@ def test_axes_may_write_at_once(path: Path) -> None:
         thread.join()
     document = json.loads(path.read_text())
     assert {name: record["setpoint"] for name, record in document["axes"].items()} == {f"axis {number}": 9.0 for number in range(4)}
+
+
+def test_programs_that_move_other_axes_lose_nothing_of_each_other(path: Path) -> None:
+    program = """
+import sys
+from pathlib import Path
+from rig.axisrecord import AxisRecords
+for number in range(40):
+    AxisRecords(Path(sys.argv[1])).put(f"{sys.argv[2]} {number}", setpoint=0.0, readback=0.0, under_way=True, homed=True)
+"""
+    processes = [subprocess.Popen([sys.executable, "-c", program, str(path), name], cwd=ROOT) for name in ("one", "two", "three")]
+    assert [process.wait(60) for process in processes] == [0, 0, 0]
+    assert len(AxisRecords(path).fields()) == 120
+
+
+def test_one_that_never_ends_writing_is_not_waited_for(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.axisrecord.PATIENCE_S", 0.05)
+    path.parent.mkdir()
+    with (path.parent / ".axes.json.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(
+            RunError, match=r"axes\.json: cannot be written: another program has been writing it for 0.05 s; no motion begins"
+        ):
+            AxisRecords(path).put("one", setpoint=1.0, readback=1.0, under_way=True, homed=True)
+
+
+@pytest.mark.parametrize(
+    ("under_way", "says"), [(True, "no motion begins without it"), (False, "where the axis stands now is not on record")]
+)
+def test_what_cannot_be_written_is_said_as_it_is(path: Path, under_way: bool, says: str) -> None:
+    path.parent.write_text("a file where a folder should be")
+    records = AxisRecords(path)
+    with pytest.raises(RunError, match=rf"axes\.json: cannot be written: File exists; {says}$"):
+        records.put("one", setpoint=1.0, readback=1.0, under_way=under_way, homed=True)
+    with pytest.raises(RunError, match=r"axes\.json: cannot be read: Not a directory$"):
+        records.get("one")
+    assert records.fields() == {}
+
+
+def test_a_full_disk_leaves_the_old_record_and_no_rubbish(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    records = AxisRecords(path)
+    records.put("one", setpoint=1.0, readback=1.0, under_way=False, homed=True)
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("rig.files.os.fsync", full)
+    with pytest.raises(RunError, match="No space left on device"):
+        records.put("one", setpoint=2.0, readback=1.0, under_way=True, homed=True)
+    assert records.fields()["one"]["setpoint"] == 1.0
+    assert sorted(child.name for child in path.parent.iterdir()) == [".axes.json.lock", "axes.json"]
 
 
 @pytest.mark.parametrize(

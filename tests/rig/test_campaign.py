@@ -6,7 +6,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from tests.rig.campaign import STAGES, Outcome, kinds, trial
+from tests.rig.campaign import INTERRUPT, READERS, STAGES, Outcome, kinds, trial
 
 PER_KIND = 4
 UNDISTURBED = 6
@@ -33,7 +33,18 @@ def test_nothing_hangs_no_wrong_reading_is_good_and_no_arm_leaves_its_limits(out
 @pytest.mark.slow
 def test_every_kind_struck_and_every_make_was_there(outcomes: list[Outcome]) -> None:
     assert {outcome.kind for outcome in outcomes if outcome.struck} == set(kinds())
-    assert {part for outcome in outcomes for part in outcome.bench.split("/")[:2]} == set(STAGES)
+    assert {part for outcome in outcomes for part in outcome.bench.split("/")[:2]} >= {*STAGES, "linear"}
+
+
+@pytest.mark.slow
+def test_every_work_was_done_and_some_of_it_interrupted(outcomes: list[Outcome]) -> None:
+    assert (
+        {"sweep", "interrupted sweep", "om20", "optoncdt"}
+        <= {outcome.work for outcome in outcomes}
+        <= {"sweep", "interrupted sweep", *READERS}
+    )
+    interrupted = [outcome for outcome in outcomes if outcome.ended == "Interrupted"]
+    assert {outcome.kind == INTERRUPT for outcome in interrupted} == {True, False}
 
 
 @pytest.mark.slow

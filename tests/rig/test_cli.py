@@ -151,7 +151,7 @@ def test_a_port_that_is_not_there(rig, tmp_path: Path) -> None:
     rig("init")
     (tmp_path / "rig.toml").write_text((tmp_path / "rig.toml").read_text().replace("/dev/ttyUSB1", "/dev/ttyNONE"))
     done = rig("sweep", "--cultivar", "RR", check=1)
-    assert "TransportTimeout: keithley-6485 on /dev/ttyNONE" in done.stderr.splitlines()[-1]
+    assert "TransportTimeout: sensor on /dev/ttyNONE" in done.stderr.splitlines()[-1]
     assert "Traceback" not in done.stderr
     assert not list((tmp_path / "rig-data" / "runs").iterdir())
 

@@ -17,6 +17,7 @@ import pytest
 from drivers import catalogue
 from rig.axisrecord import AxisRecords
 from rig.runs import Run
+from rig.trace import Trace
 from rig.workspace import Workspace
 from sim.faults import Fault
 from sim.serve import Running
@@ -96,6 +97,12 @@ def test_probe_tells_identity_and_state_and_moves_nothing(lab: Lab, running: Run
     rows = {row["name"]: row for row in told["devices"]}
     assert list(rows) == [*AXES, *SENSORS]
     assert all(row["error"] == "" for row in rows.values())
+    assert re.search(r"; own position \d+(\.\d+)? deg, ", lines[1])
+    (detector,) = lab.rig("status", "detector", "--json").json["axes"]
+    assert rows["detector"]["state"]["own_position"] == pytest.approx(detector["position"] + 100.0, abs=0.001)  # its offset
+    assert all(re.search(r"; (reads -?\d|not good)", line) for line in lines[3:])
+    assert rows["lamp"]["state"]["value"] == pytest.approx(float(running.world.truth(45.0, -20.0, "apogee")), rel=0.1)
+    assert (rows["sensor"]["state"]["unit"], rows["sensor"]["state"]["good"]) == ("A", True)
     assert {rows[name]["identity"]["vendor"] for name in rows} == {
         "Newport",
         "Zaber",
@@ -145,11 +152,13 @@ def test_status_tells_position_limits_and_last_command(homed: Lab) -> None:
 
 
 def test_homing_is_done_where_it_is_needed(lab: Lab, running: Running) -> None:
+    lab.rig("home", "source")
     lab.rig("home", "detector", "--again")
     lab.rig("move", "detector", "-20")
     had = lab.rig("home", "detector")
     assert had.out == "SIMULATED: detector had its reference, at -20.000 deg\n"
     again = lab.rig("home", "detector", "x", "--again", "--json").json
+    assert all(row["simulated"] is True for row in again)
     assert [(row["axis"], row["homed"], row["moved"]) for row in again] == [("detector", True, True), ("x", True, True)]
     assert again[0]["position"] == pytest.approx(-100.0, abs=0.001)
 
@@ -159,7 +168,7 @@ def test_a_move_goes_there_negative_ones_too(homed: Lab, running: Running) -> No
     assert moved.out == "SIMULATED: detector at -30.000 deg\n"
     assert running.world.arms["detector"].nominal(running.world.clock.now()) == pytest.approx(-30.0, abs=0.001)
     row = homed.rig("move", "detector", "-12.5", "--json", "--trace", "move.jsonl").json
-    assert row == {"axis": "detector", "setpoint": -12.5, "readback": pytest.approx(-12.5, abs=0.001), "unit": "deg"}
+    assert row == {"axis": "detector", "setpoint": -12.5, "readback": pytest.approx(-12.5, abs=0.001), "unit": "deg", "simulated": True}
     homed.rig("move", "source", "30")
     assert running.world.arms["source"].nominal(running.world.clock.now()) == pytest.approx(30.0, abs=0.01)
     homed.rig("move", "x", "12.5")
@@ -178,6 +187,8 @@ REFUSED = {
     "no such sensor": (("read", "ear"), 2, "no sensor 'ear' in rig.toml; there are sensor, lamp, plate"),
     "no position": (("move", "detector"), 2, "Missing argument"),
     "an option that is none": (("move", "detector", "10", "--fast"), 2, "--fast"),
+    "an option mistyped": (("move", "detector", "-10", "--hom"), 2, "--hom"),
+    "a number mistyped": (("move", "detector", "-1o"), 2, "-1"),
 }
 
 
@@ -188,6 +199,7 @@ def test_what_cannot_be_is_refused_in_one_line_before_anything_is_opened(tmp_pat
     arguments, code, says = REFUSED[case]
     done = lab.rig(*arguments, code=code)
     assert says in done.err
+    assert says[:1] != "-" or re.match(rf"rig: No such option:? '?{says}\b", done.err)
     assert re.fullmatch(r"rig: .*\n", done.err)
     assert done.out == ""
     assert [path.name for path in tmp_path.iterdir()] == ["rig.toml"]
@@ -301,10 +313,76 @@ def test_a_signal_during_homing_stops_the_axis(homed: Lab, running: Running) -> 
 
 def test_stop_tells_every_axis(homed: Lab, running: Running) -> None:
     seen = len(running.stops())
-    assert homed.rig("stop").out == "".join(f"SIMULATED: {name}: told to stop\n" for name in AXES)
+    lines = homed.rig("stop").out.splitlines()
+    assert [re.fullmatch(r"SIMULATED: (\w+): told to stop, at rest at -?\d+\.\d{3} (deg|mm)", line)[1] for line in lines] == AXES  # type: ignore[index]
     assert {stop.axis for stop in running.stops()[seen:]} == {"newport:1", "stages:2", "linear:1"}
     told = homed.rig("stop", "--json").json
-    assert told["ended"] is None
+    assert (told["simulated"], told["owners"]) == (True, [])
+    assert all(row["simulated"] is True for row in told["axes"])
+
+
+# A disk that takes nothing
+
+
+def test_a_trace_that_broke_off_is_said_at_the_end_and_spoils_nothing(
+    homed: Lab, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def breaks(self: Trace, *_: object) -> None:
+        leave(self, None, None, None)
+        self.broken = "--trace: the disk is full"
+
+    leave = Trace.__exit__
+    monkeypatch.setattr(Trace, "__exit__", breaks)
+    homed.rig("move", "x", "22.5")
+    done = homed.rig("move", "x", "21", "--trace", "wires.jsonl")
+    assert done.out == "SIMULATED: x at 21.000 mm\n"
+    assert done.err == "--trace: the disk is full\n"
+    config = homed.configure()
+    head = json.loads((homed.folder / "wires.jsonl").read_text().splitlines()[0])
+    assert head["records"][config.axes["x"].identity]["setpoint"] == 22.5  # as it was when the command began
+
+
+def test_without_a_workspace_that_can_be_written_nothing_moves_and_one_line_says_so(homed: Lab, running: Running) -> None:
+    (homed.folder / "rig-data" / "axes.json").unlink()
+    (homed.folder / "rig-data").rename(homed.folder / "elsewhere")
+    (homed.folder / "rig-data").write_text("a file where a folder should be")
+    before = {name: track.nominal(running.world.clock.now())[0] for name, track in running.world.axes.items()}
+    for command in (("home", "x", "--again"), ("move", "detector", "-30"), ("sweep", "--cultivar", "RR", "--theta-r", "0")):
+        done = homed.rig(*command, code=1)
+        assert re.fullmatch(r"(note: .*\n)*rig: .*rig-data.*\n", done.err)
+    assert {name: track.nominal(running.world.clock.now())[0] for name, track in running.world.axes.items()} == before
+    looked = homed.rig("status", "detector")
+    assert "SIMULATED: detector: -20.000 deg" in looked.out
+    assert re.fullmatch(r"note: .*axes\.json: cannot be read: .*\n", looked.err)
+    homed.rig("stop")
+    homed.rig("read", "lamp")
+
+
+def test_a_damaged_record_is_a_notice_to_who_looks_and_an_error_to_who_moves(homed: Lab, running: Running) -> None:
+    (homed.folder / "rig-data" / "axes.json").write_text("{")
+    looked = homed.rig("status", "x")
+    assert looked.out.startswith("SIMULATED: x: ")
+    assert re.fullmatch(r"note: .*axes\.json: not the record .*\n", looked.err)
+    assert "not the record" in homed.rig("move", "x", "1", code=1).err
+    homed.rig("stop")
+
+
+def test_when_the_end_of_a_motion_cannot_be_written_it_does_not_say_that_nothing_was_moved(
+    homed: Lab, running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rig import files
+
+    def fills_up(path: Path, text: str) -> None:
+        if '"under_way": false' in text.split(f'"{homed.urls["linear"]}')[1]:
+            raise OSError(28, "No space left on device")
+        files.write_atomically(path, text)
+
+    monkeypatch.setattr("rig.axisrecord.write_atomically", fills_up)
+    done = homed.rig("move", "x", "33", code=1)
+    assert re.fullmatch(
+        r"rig: .*axes\.json: cannot be written: No space left on device; where the axis stands now is not on record\n", done.err
+    )
+    assert running.world.axes["linear:1"].nominal(running.world.clock.now())[0] == pytest.approx(33.0, abs=0.001)
 
 
 # Reading
@@ -316,7 +394,7 @@ def test_read_takes_readings_of_all_sensors(homed: Lab, running: Running) -> Non
     assert [line.split()[1] for line in lines] == SENSORS
     rows = [json.loads(line) for line in homed.rig("read", "--count", "2", "--json", "--trace", "read.jsonl").out.splitlines()]
     assert [row["sensor"] for row in rows] == SENSORS * 2
-    assert all(row["good"] for row in rows)
+    assert all(row["good"] and row["simulated"] is True for row in rows)
     current, lamp, plate = rows[:3]
     assert current["value"] == pytest.approx(float(running.world.truth(45.0, -20.0)), rel=0.05)
     assert (current["unit"], lamp["unit"], plate["unit"]) == ("A", "umol/(m^2 s)", "mm")

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import os
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from drivers import catalogue
 from drivers.errors import TransportTimeout
-from drivers.kinds import AxisState
+from drivers.kinds import AxisState, LightReading
 from rig.axisrecord import AxisRecords
 from rig.bench import Paperwork
-from rig.probing import axis_rows, probe_rows, stop_rows
-from tests.rig.scripted import SCRIPTED, ScriptedBench, rest, scripted_bench
+from rig.ownership import claimed, owners
+from rig.probing import axis_rows, probe_rows
+from rig.stopping import Ending, stop_rows
+from tests.rig.scripted import SCRIPTED, ScriptedBench, ScriptedEye, rest, scripted_bench
 
 AXES = ("source", "detector", "tilt")
 ALL = [*AXES, "sensor", "lamp", "other"]
@@ -32,10 +38,46 @@ def test_every_instrument_is_a_row_in_the_order_of_the_file(scripted: ScriptedBe
     rows = probe_rows(scripted.config, Paperwork())
     assert [row["name"] for row in rows] == ALL
     assert [row["error"] for row in rows] == [""] * 6
-    assert rows[2]["state"] == {"position": 1.2346, "unit": "deg", "moving": True, "homed": False, "warnings": ["WR", "FS"]}
+    assert rows[2]["state"] == {"own_position": 1.2346, "unit": "deg", "moving": True, "homed": False, "warnings": ["WR", "FS"]}
     assert rows[2]["identity"]["model"] == "scripted"
-    assert rows[3]["state"] == {"unit": "lx", "integration_s": 0.1}
+    assert rows[3]["state"] == {"value": 1.0, "unit": "lx", "good": True, "status": 0, "flags": [], "integration_s": 0.1}
     assert sorted(scripted.closed) == sorted(scripted.opened) == sorted(["one", "two", "three", "four", "five", "six"])
+
+
+def test_what_needs_somebody_to_take_a_picture_is_not_read(scripted: ScriptedBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = dict(catalogue.load().models)
+    known["scripted-eye"] = replace(known["scripted-eye"], reads_at_once=False)
+    monkeypatch.setattr("drivers.catalogue.load", lambda: catalogue.Catalogue(known))
+    monkeypatch.setattr(ScriptedEye, "read", lambda self: pytest.fail("was read"))
+    assert probe_rows(scripted.config, Paperwork())[3]["state"] == {"unit": "lx", "integration_s": 0.1}
+
+
+def test_a_reading_that_is_not_good_is_told_as_such(scripted: ScriptedBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    over = LightReading(math.inf, "lx", 4, over_range=True, flags=("overflow",))
+    monkeypatch.setattr(ScriptedEye, "read", lambda self: over)
+    state = probe_rows(scripted.config, Paperwork())[3]["state"]
+    assert (state["value"], state["good"], state["status"], state["flags"]) == (None, False, 4, ["over_range", "overflow"])
+
+
+def test_what_another_program_has_is_not_opened(scripted: ScriptedBench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("rig.ownership.PLACES", ())
+    monkeypatch.setattr("rig.ownership.tempfile.gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr("rig.ownership.PATIENCE_S", 0.0)
+    records = AxisRecords(tmp_path / "axes.json")
+    with claimed(["two", "five"]):
+        since = owners(["two"])[0].since
+        records.put("two scripted-stage", setpoint=-20.0, readback=0.0, under_way=True, homed=True)
+        rows = axis_rows(scripted.config, AXES, Paperwork(records=records))
+        probed = probe_rows(scripted.config, Paperwork())
+        monkeypatch.setattr("rig.axisrecord.time.time", lambda: since - 1.0)  # an older program's
+        records.put("two scripted-stage", setpoint=-20.0, readback=0.0, under_way=True, homed=True)
+        older = axis_rows(scripted.config, AXES, Paperwork(records=records))
+    assert not {"two", "five"} & set(scripted.opened)
+    assert [row["error"] for row in rows] == ["", "", ""]
+    assert [row["in_use_by"] and row["in_use_by"]["pid"] for row in rows] == [None, os.getpid(), None]
+    assert rows[1]["last_command"].endswith(", on its way")
+    assert older[1]["last_command"].endswith(", its end was not seen")
+    assert [row["name"] for row in probed if "in use by process" in row["error"]] == ["detector", "lamp"]
 
 
 def test_looking_moves_and_sets_nothing(scripted: ScriptedBench) -> None:
@@ -73,7 +115,7 @@ def test_a_stop_waits_for_no_other_port(scripted: ScriptedBench) -> None:
 
     scripted.stages["source"].on_stop = wait_in_vain
     scripted.stages["tilt"].on_stop = stopped.set
-    rows = stop_rows(scripted.config, Paperwork())
+    rows = stop_rows(scripted.config, Ending([]), Paperwork())
     assert stopped.is_set()
     assert [(row["name"], row["error"] == "") for row in rows] == [("source", False), ("detector", True), ("tilt", True)]
     assert [stage.told for stage in scripted.stages.values()] == [[("stop", None)]] * 3

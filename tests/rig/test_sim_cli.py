@@ -15,6 +15,10 @@ import pytest
 
 from sim.serve import INSTRUMENTS
 from tests.conftest import rig_environment
+from tests.rig.lab import INSTRUMENTS as MIXED_INSTRUMENTS
+from tests.rig.lab import Lab, places, serving
+
+WORK = (("home", "source", "detector"), ("move", "detector", "-40"), ("move", "source", "30"))
 
 Rig = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -128,3 +132,41 @@ def test_a_recorded_probe_is_answered_again_without_instruments(tmp_path: Path, 
     assert [device["identity"] for device in again["devices"]] == [device["identity"] for device in first["devices"]]
     assert [device["state"] for device in again["devices"]] == [device["state"] for device in first["devices"]]
     assert talk.splitlines()[-1] == "all that was recorded has been asked"
+
+
+def test_what_moved_on_a_bench_moves_again_in_a_fresh_folder(tmp_path: Path) -> None:
+    recording, playing = Lab(tmp_path / "recording"), Lab(tmp_path / "playing")
+    for lab in (recording, playing):
+        lab.folder.mkdir()
+    said = {}
+    with serving(*MIXED_INSTRUMENTS, source="newport:1", detector="stages:2") as running:
+        recording.urls.update(places(running))
+        config = recording.configure()
+        for number, work in enumerate(WORK):
+            said[work] = recording.rig(*work, "--trace", f"{number}.jsonl").out
+    for number, work in enumerate(WORK):
+        again = Lab(playing.folder / str(number))
+        again.folder.mkdir()
+        trace = recording.folder / f"{number}.jsonl"
+        with served(again.folder, "replay", str(trace), "--toml", "rig.toml") as (process, _):
+            assert again.rig(*work).out == said[work]
+            assert end(process, signal.SIGINT) == "all that was recorded has been asked\n"
+        text = (again.folder / "rig.toml").read_text()
+        assert not any(device.port in text for device in config.devices.values())
+    # The source's controller does not know that it was homed: it moved because the record said so.
+    last = recording.folder / f"{len(WORK) - 1}.jsonl"
+    forgetful = Lab(playing.folder / "forgetful")
+    forgetful.folder.mkdir()
+    with served(forgetful.folder, "replay", str(last), "--toml", "rig.toml") as (process, _):
+        (forgetful.folder / "rig-data" / "axes.json").unlink()
+        assert "source has no reference" in forgetful.rig(*WORK[-1], code=None).err
+        end(process, signal.SIGINT)
+
+
+def test_a_trace_without_its_configuration_makes_no_bench(tmp_path: Path, rig: Rig) -> None:
+    (tmp_path / "t.jsonl").write_text('{"trace": 1, "started": "2024-05-01T12:00:00+00:00"}\n')
+    done = rig("sim", "replay", "t.jsonl", "--toml", "rig.toml", check=2)
+    assert done.stderr == "rig: trace t.jsonl, line 1: holds no configuration to make a rig.toml of\n"
+    (tmp_path / "rig.toml").write_text("mine\n")
+    assert "is there already" in rig("sim", "replay", "t.jsonl", "--toml", "rig.toml", check=2).stderr
+    assert (tmp_path / "rig.toml").read_text() == "mine\n"

@@ -245,7 +245,7 @@ def test_its_instruments_are_configured_probed_moved_and_read(
     assert lab.rig("move", "detector", "2", code=1).err.startswith("rig: detector at 2 deg would stand within 3 deg")
     assert lab.rig("read").out == "sensor 70 lx\n"
     assert "detector: -30.000 deg, at rest, homed" in lab.rig("status").out
-    assert lab.rig("stop").out == "source: told to stop\ndetector: told to stop\n"
+    assert lab.rig("stop").out == "source: told to stop, at rest at 0.000 deg\ndetector: told to stop, at rest at -30.000 deg\n"
     lab.rig("sweep", "--cultivar", "RR", "--theta-r", "-20,20", "--out", "run")
     run = Run(tmp_path / "run")
     assert [(reading.theta_r, reading.value, reading.unit) for reading in run.readings] == [(-20.0, 80.0, "lx"), (20.0, 120.0, "lx")]

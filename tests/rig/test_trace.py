@@ -123,6 +123,9 @@ trace = Trace(Path({str(path)!r}), {{"bench": "b"}})
 listen = trace.traffic("p")
 for number in range(100):
     listen(time.monotonic(), "tx", b"%d" % number)
+until = time.monotonic() + 10
+while '"3939"' not in Path({str(path)!r}).read_text() and time.monotonic() < until:
+    time.sleep(0.001)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False)
@@ -150,6 +153,97 @@ def test_ports_may_write_at_once_and_after_the_end(tmp_path: Path) -> None:
     assert len(events) == 800
     for number in range(4):
         assert [event.data for event in events if event.port == f"port {number}"] == [bytes([number, count]) * 50 for count in range(200)]
+
+
+class StuckFile:
+    """A file on a disk that takes nothing until it is let."""
+
+    def __init__(self, file: Any) -> None:
+        self.let = threading.Event()
+        self._file = file
+
+    def write(self, data: bytes) -> int:
+        assert self.let.wait(30)
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def test_a_disk_that_takes_its_time_does_not_hold_up_the_wires(tmp_path: Path) -> None:
+    path = tmp_path / "t.jsonl"
+    with Trace(path, {}) as trace:
+        stuck = StuckFile(trace._file)
+        trace._file = stuck  # type: ignore[assignment]
+        listen = trace.traffic("p")
+        for number in range(1000):  # and none of them waits
+            listen(time.monotonic(), "tx", b"%d" % number)
+        assert len(lines_of(path)) == 1
+        stuck.let.set()
+    assert [event.data for event in replay.load(path).events] == [b"%d" % number for number in range(1000)]
+    assert trace.broken == ""
+
+
+def test_what_a_disk_cannot_keep_up_with_is_said_to_be_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig.trace.MOST_WAITING", 50)
+    monkeypatch.setattr("rig.trace.CLOSING_S", 0.01)
+    path = tmp_path / "t.jsonl"
+    with Trace(path, {}) as trace:
+        stuck = StuckFile(trace._file)
+        trace._file = stuck  # type: ignore[assignment]
+        listen = trace.traffic("p")
+        for number in range(100):
+            listen(time.monotonic(), "tx", b"%d" % number)
+        assert trace.broken == f"--trace {path}: the disk is too slow: what came later is missing"
+    stuck.let.set()
+    trace._writer.join(10)
+    kept = [event.data for event in replay.load(path).events]
+    assert 50 <= len(kept) <= 100
+    assert kept == [b"%d" % number for number in range(len(kept))]
+
+    with Trace(tmp_path / "u.jsonl", {}) as trace:
+        stuck = StuckFile(trace._file)
+        trace._file = stuck  # type: ignore[assignment]
+        trace.traffic("p")(time.monotonic(), "rx", b"a")
+    assert trace.broken == f"--trace {tmp_path / 'u.jsonl'}: the disk has not taken all of it within 0.01 s"
+    stuck.let.set()
+    trace._writer.join(10)
+
+
+def test_a_disk_that_is_full_is_said_at_the_end_and_breaks_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "t.jsonl"
+    program = f"""
+import resource, time
+from pathlib import Path
+from rig.trace import Trace
+resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+with Trace(Path({str(path)!r}), {{}}) as trace:
+    listen = trace.traffic("p")
+    for number in range(100):
+        listen(time.monotonic(), "tx", b"%d" % number)
+    until = time.monotonic() + 10
+    while not trace.broken and time.monotonic() < until:
+        time.sleep(0.001)
+    listen(time.monotonic(), "rx", b"later")
+print(trace.broken)
+"""
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == (f"--trace {path}: cannot be written any more: File too large\n", "")
+    events = replay.load(path).events  # its beginning, without gaps
+    assert len(events) > 10
+    assert [event.data for event in events] == [b"%d" % number for number in range(len(events))]
+
+
+def test_what_was_known_of_the_axes_is_in_the_first_line(tmp_path: Path) -> None:
+    known = {
+        "socket://somewhere:1 newport-esp301 axis=1": {"setpoint": 3.0, "readback": 3.0, "under_way": False, "homed": True, "time": 1.0}
+    }
+    with Trace(tmp_path / "t.jsonl", {"bench": "b"}, known):
+        pass
+    assert replay.load(tmp_path / "t.jsonl").about["records"] == known
 
 
 # Record and replay

@@ -200,7 +200,7 @@ async def talk(stage: Scene) -> None:
 def test_kinds() -> None:
     assert KINDS == (
         "silence", "delay", "dropped-byte", "doubled-byte", "garbage", "cut-short", "wrong-checksum", "wrong-address", "stale-reply",
-        "unplugged", "alarm", "stall", "limit-hit", "over-range",
+        "unplugged", "frozen", "alarm", "stall", "limit-hit", "over-range",
     )  # fmt: skip
 
 
@@ -220,7 +220,7 @@ def test_nonsense_is_refused_with_what_is_allowed(text: str) -> None:
 @pytest.mark.parametrize("name", MAKERS)
 def test_applicable(name: str) -> None:
     instrument = MAKERS[name](ManualClock())
-    bytewise = {"delay", "unplugged", *BYTES} - (set() if name in CHECKED else {"wrong-checksum", "wrong-address"})
+    bytewise = {"delay", "unplugged", "frozen", *BYTES} - (set() if name in CHECKED else {"wrong-checksum", "wrong-address"})
     assert applicable(instrument) == tuple(kind for kind in KINDS if kind in bytewise or kind in INSIDE[name])
     faulty = Faulty(instrument, ManualClock())
     assert applicable(faulty) == applicable(instrument)
@@ -393,10 +393,10 @@ def test_an_abort_is_not_kept_waiting() -> None:
     scene("keithley", act, Fault("silence", after=99))
 
 
-# Late, and unplugged
+# Late, unplugged, and frozen
 
 
-@pytest.mark.parametrize(("kind", "low", "high"), [("delay", 0.2, 3.0), ("unplugged", 0.1, 1.0)])
+@pytest.mark.parametrize(("kind", "low", "high"), [("delay", 0.2, 3.0), ("unplugged", 0.1, 1.0), ("frozen", 2.0, 6.0)])
 def test_how_long_is_drawn(kind: str, low: float, high: float) -> None:
     async def act(stage: Scene) -> None:
         await stage.say(b"/1 0 01\n")
@@ -525,6 +525,22 @@ def test_unplugging_ends_a_measurement_under_way() -> None:
 
     stage = scene("ls-100", act)
     assert stage.heard == [b"OK00,   123.4\r\n"]
+
+
+@pytest.mark.parametrize("seed", [TO_INSTRUMENT, FROM_INSTRUMENT])
+def test_on_a_frozen_wire_nothing_passes_and_nobody_is_hung_up_on(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    monkeypatch.setattr(sim.faults, "_FROZEN", (3600.0, 3600.0))
+
+    async def act(stage: Scene) -> None:
+        assert await stage.ask(b"1MO\r1MO?\r") == b""
+        assert await stage.ask(b"1MF\r") == b""
+        assert await stage.ask(b"1MO?\r") == b""
+        assert not next(iter(stage.faulty._lines)).hung_up.done()
+        stage.faulty._thawed = 0.0
+        # 1MO is lost on its way, or is carried out and the answer to the question after it is lost; 1MF is lost anyhow.
+        assert await stage.ask(b"1MO?\r") == (b"0\r\n" if seed == TO_INSTRUMENT else b"1\r\n")
+
+    assert scene("newport", act, Fault("frozen", seed)).faulty.struck[0].way == (TOWARDS if seed == TO_INSTRUMENT else FROM)
 
 
 # Inside the instruments

@@ -276,3 +276,13 @@ def test_a_halt_planned_ahead_happens_unless_something_else_comes_first() -> Non
         assert track.reach(5.0, since)[1] == pytest.approx(36.0)
     assert track.nominal(5.0) == (pytest.approx(36.0), 0.0)
     assert track.end == pytest.approx(0.7)
+
+
+def test_departures_are_motions_from_rest_and_not_what_took_over_from_them() -> None:
+    track = Track(0.0, STILL)
+    assert track.departures == ()
+    track.begin(1.0, to_target(0.0, 0.0, 10.0, 5.0, 5.0))
+    track.begin(2.0, to_rest(track.nominal(2.0)[1], 5.0))
+    track.begin(5.0, ())
+    track.begin(6.0, to_target(track.nominal(6.0)[0], 0.0, 0.0, 5.0, 5.0))
+    assert track.departures == (1.0, 6.0)

@@ -1,4 +1,4 @@
-"""The luminance meters as seen by somebody else's client: psychopy-minolta, over a socket since pseudo-terminals know no 7E2."""
+"""The luminance meters as seen by somebody else's client: psychopy-minolta."""
 
 from __future__ import annotations
 
@@ -28,17 +28,19 @@ def photometer(colour: bool, luminance: float = 123.4) -> Photometer:
     return Photometer(SimClock(SPEED), lambda t0, t1: luminance, np.random.default_rng(1), unit, chroma=lambda t0, t1: (0.31, 0.33))
 
 
-@pytest.fixture
-def over_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(params=["tcp", "pty"])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return which of an instrument's ports to try, and have the client open it where that is a URL."""
     import serial
 
-    monkeypatch.setattr(minolta.serial, "Serial", lambda port: serial.serial_for_url(port))
+    if request.param == "tcp":
+        monkeypatch.setattr(minolta.serial, "Serial", lambda port: serial.serial_for_url(port))
+    return str(request.param)
 
 
-@pytest.mark.usefixtures("over_sockets")
-def test_ls100() -> None:
+def test_ls100(way: str) -> None:
     with served(lambda: photometer(colour=False)) as (_, ports):
-        client: Any = minolta.LS100(ports.tcp)
+        client: Any = minolta.LS100(getattr(ports, way))
         assert client.OK
         assert client.setMode("04")
         assert client.measure() == 123.4
@@ -48,10 +50,9 @@ def test_ls100() -> None:
         client.com.close()
 
 
-@pytest.mark.usefixtures("over_sockets")
-def test_cs100a() -> None:
+def test_cs100a(way: str) -> None:
     with served(lambda: photometer(colour=True)) as (_, ports):
-        client: Any = minolta.CS100A(ports.tcp)
+        client: Any = minolta.CS100A(getattr(ports, way))
         assert client.OK
         client.measure()
         assert client.lastLum == 123.4

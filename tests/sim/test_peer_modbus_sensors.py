@@ -27,7 +27,8 @@ def master(request: pytest.FixtureRequest) -> Iterator[Open]:
     opened: list[Any] = []
 
     def make(ports: Any, baud: int) -> Any:
-        port = serial.serial_for_url(getattr(ports, request.param), baudrate=baud, timeout=0.3)  # masters wait it out when a reply is short
+        # Masters wait the time-out out when a reply is short.
+        port = serial.serial_for_url(getattr(ports, request.param), baudrate=baud, parity="E", timeout=0.3)
         opened.append(port)
         return minimalmodbus.Instrument(port, 1)
 

@@ -160,7 +160,7 @@ def test_every_instrument_is_served_and_answers(quiet: None, connect: Connect) -
                 hear(lambda terminal=terminal: os.read(terminal, 4096), pattern)
             finally:
                 os.close(terminal)
-        assert {device["line"] for device in devices if "tcp" in device} >= {"115200 8E1, Modbus RTU", "9600 8N1, CR; replies LF"}
+        assert {device["line"] for device in devices if "tcp" in device} >= {"115200 8E1, Modbus RTU", "9600 8N1, LF both ways"}
         folder = running.folder("camera")
         assert devices[-1] == {"name": "camera", "model": "camera-folder", "description": INSTRUMENTS["camera"], "folder": str(folder)}
         (folder / ".shutter").touch()

@@ -7,7 +7,9 @@ import contextlib
 import os
 import random
 import select
+import termios
 import threading
+import time
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
@@ -231,3 +233,27 @@ def test_a_socket_is_hung_up_on_and_a_line_says_whether_it_would_be(quiet: None,
         with open_pty(ports.pty) as port:
             assert ask(port, b"again") == b"again\n"
         assert instrument.hang_up[1] is False
+
+
+@pytest.mark.parametrize("line", [{"parity": "E"}, {"parity": "E", "bytesize": 7, "stopbits": 2}, {"parity": "O", "rtscts": True}])
+def test_a_pty_is_opened_again_and_again_with_settings_it_has_not(quiet: None, line: dict[str, Any]) -> None:
+    with served(Asked) as (_, ports):
+        for text in (b"one\n", b"two\n", b"three\n"):
+            with serial.Serial(ports.pty, 57600, timeout=10, **line) as port:
+                port.write(text)
+                assert port.read_until(b"\n") == text
+                port.timeout = 11.0  # a change of nothing that a terminal keeps
+                port.write(b"\xe1\x00\n")
+                assert port.read_until(b"\n") == b"\xe1\x00\n"
+
+
+def test_a_pty_can_be_opened_again_though_nothing_was_said(quiet: None) -> None:
+    with served(Asked) as (_, ports):
+        for _ in range(3):
+            until = time.monotonic() + 10
+            while True:  # it takes a moment to be seen that a client has come and gone
+                try:
+                    serial.Serial(ports.pty, 4800, bytesize=7, parity="E", stopbits=2).close()
+                    break
+                except termios.error:
+                    assert time.monotonic() < until
