@@ -132,7 +132,7 @@ def open_bench(
     """
     paperwork = paperwork or Paperwork()
     chosen = tuple(ANGLES) if axes is None else tuple(axes)
-    wanted = [name for name, each in config.sensors.items() if each.monitor or name == MAIN_SENSOR] if sensors is None else list(sensors)
+    wanted = config.sweep_sensors if sensors is None else tuple(sensors)
     with ExitStack() as stack:
         ports = stack.enter_context(open_ports(config, specimen, trace=paperwork.trace, report=paperwork.report))
         bench = Bench(config, ports.clock, ports.simulation)

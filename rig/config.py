@@ -106,6 +106,11 @@ class BenchConfig:
         return self.sensors[MAIN_SENSOR]
 
     @property
+    def sweep_sensors(self) -> tuple[str, ...]:
+        """Names of the sensors that a sweep reads: the main one and the monitors."""
+        return tuple(name for name, sensor in self.sensors.items() if sensor.monitor or name == MAIN_SENSOR)
+
+    @property
     def devices(self) -> dict[str, AxisConfig | SensorConfig]:
         """All instruments, by name."""
         return {**self.axes, **self.sensors}
@@ -127,6 +132,12 @@ def template() -> str:
     return importlib.resources.files("rig").joinpath("data/rig.toml").read_text(encoding="utf-8")
 
 
+def simulated_config() -> BenchConfig:
+    """Return the configuration of the simulated bench."""
+    text = importlib.resources.files("rig").joinpath("data/simulated.toml").read_text(encoding="utf-8")
+    return parse_config(text, "simulated.toml")
+
+
 def load_config(option: str | None) -> BenchConfig:
     """Return the configuration of `--config`, else of `./rig.toml`, else of the simulated bench.
 
@@ -137,8 +148,7 @@ def load_config(option: str | None) -> BenchConfig:
     """
     path = Path(option) if option else Path("rig.toml")
     if option is None and not path.exists():
-        text = importlib.resources.files("rig").joinpath("data/simulated.toml").read_text(encoding="utf-8")
-        return parse_config(text, "simulated.toml")
+        return simulated_config()
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as exc:

@@ -1,4 +1,4 @@
-"""A bench to replay a trace with: the rig.toml of the recording at the replay's addresses, and what was known of the axes then."""
+"""A rig.toml for instruments that are served already: simulated ones, or those of a trace with what was known of its axes then."""
 
 import json
 import tomllib
@@ -33,16 +33,18 @@ def recorded_config(about: Mapping[str, Any], trace: str) -> BenchConfig:
     return parse_config(text, f"trace {trace}, config")
 
 
-def replayed_toml(config: BenchConfig, url: Callable[[str], str]) -> str:
-    """Return `config` as a served simulation whose ports are at `url` of what they were.
+def served_toml(config: BenchConfig, url: Callable[[str], str], speed: float | None = None) -> str:
+    """Return `config` as a served simulation whose ports are at `url` of what they were, and whose `speed` may be another.
 
-    No port of the recording is left in it: nothing that works with it can reach a real instrument.
+    No port of `config` is left in it: nothing that works with it can reach a real instrument.
     """
     document = tomllib.loads(config.text)
     document["simulation"] = {key: value for key, value in document.get("simulation", {}).items() if key != "seed"} | {"served": True}
+    if speed is not None:
+        document["simulation"]["speed"] = speed
     for table in (*document["axes"].values(), document["sensor"], *document.get("sensors", {}).values()):
         table["port"] = url(table["port"])
-    return "# A recorded bench, replayed.\n" + "".join(_tables("", document))
+    return "# Instruments that are served already.\n" + "".join(_tables("", document))
 
 
 def write_bench(path: Path, config: BenchConfig, about: Mapping[str, Any], url: Callable[[str], str], workspace: Workspace) -> None:
@@ -55,7 +57,7 @@ def write_bench(path: Path, config: BenchConfig, about: Mapping[str, Any], url: 
     RunError
         The workspace cannot be written, or holds something else in their place.
     """
-    text = replayed_toml(config, url)
+    text = served_toml(config, url)
     replayed = parse_config(text, str(path))
     known = about.get("records", {})
     try:
@@ -73,6 +75,11 @@ def write_bench(path: Path, config: BenchConfig, about: Mapping[str, Any], url: 
                 under_way=record.under_way,
                 homed=record.homed,
             )
+    write_toml(path, text)
+
+
+def write_toml(path: Path, text: str) -> None:
+    """Write a rig.toml; raise ConfigError where that is not possible."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as exc:

@@ -8,7 +8,7 @@ from pathlib import Path
 from drivers.incidents import Report
 from rig.axisrecord import AxisRecords
 from rig.bench import Paperwork
-from rig.config import ANGLES, MAIN_SENSOR, BenchConfig
+from rig.config import ANGLES, BenchConfig
 from rig.ownership import claimed
 from rig.trace import Trace
 from rig.workspace import Workspace
@@ -45,8 +45,8 @@ def paperwork(
     records = AxisRecords(workspace.axes) if lasting(config) else None
     with ExitStack() as stack:
         if lasting(config):
-            usual = [*ANGLES, *(name for name, each in config.sensors.items() if each.monitor or name == MAIN_SENSOR)]
-            stack.enter_context(claimed(config.devices[name].port for name in (usual if devices is None else devices)))
+            names = (*ANGLES, *config.sweep_sensors) if devices is None else devices
+            stack.enter_context(claimed(config.devices[name].port for name in names))
         yield Paperwork(stack.enter_context(_traced(config, trace, records)) if trace else None, report, records)
 
 

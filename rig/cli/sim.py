@@ -9,9 +9,6 @@ import click
 from rig.cli.settings import Settings
 from rig.errors import ConfigError
 
-NAMES = {"source": "stages", "detector": "stages", "sensor": "meter"}
-"""Which simulated instrument each part of the bench in --toml is."""
-
 
 @click.group(epilog="\b\nExamples:\n  rig sim serve\n  rig sim serve newport apogee --json\n  rig sim replay wires.jsonl")
 def command() -> None:
@@ -59,6 +56,7 @@ def serve(
     again, and ignores them. It cannot be asked for another parity or number of bits alone once it is open (EINVAL: give them together with
     the speed, when opening), nor opened again within a hundredth of a second by a client that said nothing, and has no modem lines.
     """
+    from rig.replays import write_toml
     from sim.errors import SimError
     from sim.faults import KINDS
     from sim.serve import INSTRUMENTS, Settings, build, serving
@@ -86,7 +84,7 @@ def serve(
         )
         with beside(serving(world), "simulated instruments") as report:
             if toml is not None:
-                Path(toml).write_text(_config(report, toml), encoding="utf-8")
+                write_toml(Path(toml), _config(report, toml))
             _announce(report, as_json)
     except SimError as exc:
         raise ConfigError(str(exc)) from exc
@@ -150,13 +148,12 @@ def _announce(report: dict[str, Any], as_json: bool) -> None:
 
 def _config(report: dict[str, Any], path: str) -> str:
     """Return the simulated bench's configuration with the ports of instruments that are served already."""
-    import importlib.resources
+    from rig.config import SIMULATED_PORT, simulated_config
+    from rig.replays import served_toml
 
-    text = importlib.resources.files("rig").joinpath("data/simulated.toml").read_text(encoding="utf-8")
-    places = {device["name"]: device.get("tcp") for device in report["devices"]}
-    for name in sorted(set(NAMES.values())):
-        if name not in places:
-            raise ConfigError(f"--toml {path}: wants {' and '.join(sorted(set(NAMES.values())))} to be served")
-        text = text.replace(f'"sim:{name}"', json.dumps(places[name]))
-    text = text.replace("# The simulated bench, used where there is no rig.toml.", "# Simulated instruments that are served already.")
-    return text.replace("speed = 10.0\n", f"speed = {report['speed']}\nserved = true\n", 1)
+    places = {f"{SIMULATED_PORT}{device['name']}": device.get("tcp") for device in report["devices"]}
+    config = simulated_config()
+    needed = sorted({device.port for device in config.devices.values()})
+    if not set(needed) <= set(places):
+        raise ConfigError(f"--toml {path}: wants {' and '.join(port.removeprefix(SIMULATED_PORT) for port in needed)} to be served")
+    return served_toml(config, places.__getitem__, speed=report["speed"])
