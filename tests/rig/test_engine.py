@@ -4,7 +4,9 @@ import contextlib
 import io
 import signal
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import bluesky.plans as bp
 import numpy as np
@@ -14,12 +16,17 @@ from bluesky.simulators import check_limits
 
 from drivers.errors import DeviceFault
 from rig.bench import Bench
+from rig.config import BenchConfig
 from rig.engine import run_plan
 from rig.errors import InterlockError, Interrupted
 from rig.interrupts import Interrupts
 from rig.journal import JournalWriter, read_documents
+from rig.measuring import measure, new_order
 from rig.plans import sweep
+from rig.runs import begin_run
+from rig.status import Status
 from rig.trajectory import Trajectory
+from rig.workspace import Workspace
 
 
 @pytest.fixture
@@ -207,3 +214,31 @@ def test_a_journal_that_cannot_be_written_ends_the_run(bench: Bench) -> None:
 
     with Interrupts(bench.halt, bench.release, ask=False) as interrupts, pytest.raises(RunError, match="No space left"):
         run_plan(sweep(bench, Trajectory((45.0,), (0.0, 10.0)), {"cultivar": "RR"}), interrupts, [Full()], never)
+
+
+def test_a_signal_puts_the_brake_on_in_a_sweep_as_it_is_run(bench_config: BenchConfig, tmp_path: Path) -> None:
+    """Through `measure` itself: what a plan would begin after the signal is held back until somebody has decided."""
+    interrupt = interrupt_at(2, signal.SIGINT)
+
+    class Watcher:
+        ask = True
+        held: list[Status]
+
+        def opened(self, bench: Bench) -> None:
+            self.bench = bench
+
+        def document(self, name: str, doc: Mapping[str, Any]) -> None:
+            interrupt(name, dict(doc))
+
+        def decide(self, interrupts: Interrupts) -> bool:
+            interrupts.halted.wait(20)
+            self.held = [self.bench.axes["detector"].set(-70.0), self.bench.meter.trigger()]
+            assert not any(status.done for status in self.held)
+            return False
+
+    watcher = Watcher()
+    order = new_order(bench_config, "RR", Trajectory((45.0,), (-60.0, -30.0, 0.0, 30.0)))
+    begin_run(tmp_path / "run", bench_config.text)
+    with pytest.raises(Interrupted):
+        measure(order, tmp_path / "run", watcher, Workspace(tmp_path))
+    assert len(watcher.held) == 2
