@@ -24,7 +24,7 @@ from rig.journal import JournalWriter, read_documents
 from rig.measuring import measure, new_order
 from rig.plans import sweep
 from rig.runs import begin_run
-from rig.status import Status
+from rig.status import Status, StatusTimeout
 from rig.trajectory import Trajectory
 from rig.workspace import Workspace
 
@@ -232,8 +232,9 @@ def test_a_signal_puts_the_brake_on_in_a_sweep_as_it_is_run(bench_config: BenchC
 
         def decide(self, interrupts: Interrupts) -> bool:
             interrupts.halted.wait(20)
-            self.held = [self.bench.axes["detector"].set(-70.0), self.bench.meter.trigger()]
-            assert not any(status.done for status in self.held)
+            self.held = [self.bench.meter.trigger(), self.bench.axes["detector"].set(-70.0)]
+            with pytest.raises(StatusTimeout):  # a reading takes a hundredth of that here
+                self.held[0].exception(0.3)
             return False
 
     watcher = Watcher()
