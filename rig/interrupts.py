@@ -83,8 +83,7 @@ class Interrupts:
         signal.set_wakeup_fd(self._old_wakeup)
         os.write(self._writer, b"\0")
         self._thread.join()
-        for halting in self._halting:
-            halting.join()
+        self._await_halts()
         self._release()
         os.close(self._reader)
         os.close(self._writer)
@@ -101,6 +100,7 @@ class Interrupts:
 
     def go_on(self) -> None:
         """Forget the pause that was asked for, and let things begin again."""
+        self._await_halts()  # a stop that is still on its way would end the first motion that begins again
         self._release()
         self.pausing.clear()
 
@@ -133,6 +133,10 @@ class Interrupts:
             self._halting.append(halting)
             halting.start()
             self._pause_engine()
+
+    def _await_halts(self) -> None:
+        while self._halting:
+            self._halting.pop().join()
 
     def _halt(self) -> None:
         self.unstopped = self._halt_axes()
